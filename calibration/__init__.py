@@ -1,0 +1,1 @@
+"""Commissioning: each module is one command and one result file."""

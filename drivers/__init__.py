@@ -1,0 +1,1 @@
+"""Devices, their simulated world, capture, recording and replay."""

@@ -1,0 +1,29 @@
+"""The five errors that leave a driver; the class is the recovery policy."""
+
+
+class DriverError(Exception):
+    """Base of the five; `device` is the name of the device that raised it."""
+
+    def __init__(self, device: str, message: str) -> None:
+        super().__init__(f"{device}: {message}")
+        self.device = device
+
+
+class DeviceNotFoundError(DriverError):
+    """Nothing answers at the address. Policy: retry with backoff 0.5, 1, 2 … 30 s, for ever."""
+
+
+class DeviceLostError(DriverError):
+    """It was open and went away. Policy: close, reopen with backoff."""
+
+
+class DeviceTimeoutError(DriverError, TimeoutError):
+    """It is open but silent. Policy: retry the capture once, then treat as lost."""
+
+
+class DeviceFaultError(DriverError):
+    """It reports a fault, or impossible data. Policy: stop retrying and tell the operator."""
+
+
+class DriverUnavailableError(DriverError, ImportError):
+    """A vendor library is missing; the message names the package. Policy: exit 78."""

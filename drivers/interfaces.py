@@ -1,0 +1,93 @@
+"""What every driver provides; one Protocol for each kind of device.
+
+Calls block, each with a timeout, and raise nothing but the five errors of `drivers.errors`. A device
+is used from one thread at a time. `open()` leaves nothing open when it raises; `close()` never
+raises and may be called twice.
+"""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Protocol, Self
+
+from surfclass.frames import ColourFrame, DepthFrame, JointState
+
+
+class Clock(Protocol):
+    """The one host clock; the simulated one jumps instead of sleeping."""
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC, ns."""
+
+    def sleep(self, seconds: float) -> None:
+        """Returns after `seconds` of this clock."""
+
+
+class Device(Protocol):
+    """What all devices share; also a context manager that opens and closes."""
+
+    @property
+    def name(self) -> str:
+        """How messages call it, such as "colour"."""
+
+    @property
+    def is_open(self) -> bool:
+        """Between a successful open() and close()."""
+
+    def open(self) -> None:
+        """Raises DeviceNotFoundError, DeviceFaultError or DriverUnavailableError."""
+
+    def close(self) -> None:
+        """Leaves the device safe (a light off) and released."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+class ColourCamera(Device, Protocol):
+    """A colour camera with every automatic function off."""
+
+    def grab(self, not_before_ns: int, timeout_s: float) -> ColourFrame:
+        """Returns the first frame whose exposure BEGAN at or after `not_before_ns`.
+
+        This is what removes stale frames: a triggered camera triggers inside, a free-running one
+        discards until a frame qualifies.
+
+        Raises:
+            DeviceTimeoutError: If none came within `timeout_s` of `not_before_ns` (or of now, where
+                that is later).
+            DeviceLostError, DeviceFaultError: As the class says.
+        """
+
+
+class DepthCamera(Device, Protocol):
+    """A depth camera; one read gives depth and IR of one exposure."""
+
+    def grab(self, not_before_ns: int, timeout_s: float, with_ir: bool = False) -> DepthFrame:
+        """As `ColourCamera.grab`."""
+
+
+class Light(Device, Protocol):
+    """The LED; off after open(), after close() and in every `finally`."""
+
+    def set_level(self, level: float) -> int:
+        """Sets the level, 0…1, and returns the time from which it holds, ns.
+
+        Raises:
+            ValueError: If the level is outside 0…1.
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+
+
+class Arm(Device, Protocol):
+    """The arm's joint angles; nothing here moves it."""
+
+    def read_joints(self, timeout_s: float) -> JointState:
+        """Returns a reading taken during the call.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
