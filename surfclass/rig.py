@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from surfclass.errors import InputError, MissingCalibrationError
 from surfclass.frames import Capture
-from surfclass.schema import Number, Positive, Table, Vector3, parse_toml
+from surfclass.schema import Number, Positive, Table, Vector3, load_toml, parse_toml, validate
 from surfclass.types import Float64, Transform
 
 SCHEMA = 1
@@ -59,11 +59,17 @@ class Camera(Table):
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
 
-class Transforms(Table):
-    """Rigid transforms; `A_T_B` takes coordinates in B to coordinates in A."""
+class KnownTransforms(Table):
+    """Rigid transforms as far as they are known; `A_T_B` takes coordinates in B to coordinates in A."""
+
+    rgb_T_depth: Matrix4 | None = None
+    flange_T_depth: Matrix4 | None = None
+
+
+class Transforms(KnownTransforms):
+    """Rigid transforms of a package with a colour camera."""
 
     rgb_T_depth: Matrix4
-    flange_T_depth: Matrix4 | None = None
 
 
 class Light(Table):
@@ -150,18 +156,14 @@ class Arm(Table):
     flange_offset_m: Positive = 0.084
 
 
-class Rig(Table):
-    """The sensor package; read from `rig.toml`, whose text travels inside every recording.
-
-    What a table leaves out is None, and what needs it refuses with MissingCalibrationError.
-    """
+class DepthRig(Table):
+    """A sensor package whose colour camera need not be known: enough for a set without colour."""
 
     schema_version: Annotated[int, Field(alias="schema")]
     name: str
     voxel_size_m: Positive
-    rgb: Camera
     depth: Camera
-    transforms: Transforms
+    transforms: KnownTransforms = KnownTransforms()
     light: Light | None = None
     response: Response | None = None
     features: Features = Features()
@@ -176,6 +178,41 @@ class Rig(Table):
         if version != SCHEMA:
             raise ValueError(f"unknown schema, allowed is {SCHEMA}")
         return version
+
+    def check(self, capture: Capture) -> None:
+        """Raises InputError where an image of the capture has not the size that the rig states."""
+        colour, dark = capture.colour, capture.dark
+        images = [
+            ("depth image", capture.depth.depth_mm, self.depth),
+            ("IR image", capture.depth.ir, self.depth),
+            ("colour image", None if colour is None else colour.rgb, self._colour_camera),
+            ("dark image", None if dark is None else dark.rgb, self._colour_camera),
+            ("label image", capture.label, self._colour_camera),
+        ]
+        for what, image, camera in images:
+            if image is None:
+                continue
+            if camera is None:
+                raise InputError(f"capture {capture.name}: a {what}, but rig {self.name} has no [rgb]")
+            if image.shape[:2] != camera.shape:
+                raise InputError(
+                    f"capture {capture.name}: {what} is {image.shape[1]} × {image.shape[0]}, "
+                    f"rig {self.name} says {camera.size[0]} × {camera.size[1]}"
+                )
+
+    @property
+    def _colour_camera(self) -> Camera | None:
+        return None
+
+
+class Rig(DepthRig):
+    """The sensor package; read from `rig.toml`, whose text travels inside every recording.
+
+    What a table leaves out is None, and what needs it refuses with MissingCalibrationError.
+    """
+
+    rgb: Camera
+    transforms: Transforms
 
     @cached_property
     def rgb_T_depth(self) -> Transform:
@@ -196,22 +233,9 @@ class Rig(Table):
             )
         return Transform("flange", "depth", np.array(self.transforms.flange_T_depth))
 
-    def check(self, capture: Capture) -> None:
-        """Raises InputError where an image of the capture has not the size that the rig states."""
-        colour, dark = capture.colour, capture.dark
-        images = [
-            ("depth image", capture.depth.depth_mm, self.depth),
-            ("IR image", capture.depth.ir, self.depth),
-            ("colour image", None if colour is None else colour.rgb, self.rgb),
-            ("dark image", None if dark is None else dark.rgb, self.rgb),
-            ("label image", capture.label, self.rgb),
-        ]
-        for what, image, camera in images:
-            if image is not None and image.shape[:2] != camera.shape:
-                raise InputError(
-                    f"capture {capture.name}: {what} is {image.shape[1]} × {image.shape[0]}, "
-                    f"rig {self.name} says {camera.size[0]} × {camera.size[1]}"
-                )
+    @property
+    def _colour_camera(self) -> Camera:
+        return self.rgb
 
 
 class SurfaceClasses(Table):
@@ -241,6 +265,16 @@ def parse_rig(text: str | bytes, source: str) -> Rig:
         ConfigurationError: Naming every fault by its path, an unknown schema among them.
     """
     return parse_toml(Rig, text, source)
+
+
+def parse_depth_rig(text: str | bytes, source: str) -> DepthRig:
+    """Returns a Rig, or a DepthRig where the text has no [rgb] table.
+
+    Raises:
+        ConfigurationError: As `parse_rig`.
+    """
+    data = load_toml(text, source)
+    return validate(Rig if "rgb" in data else DepthRig, data, source)
 
 
 def parse_classes(text: str | bytes, source: str) -> SurfaceClasses:

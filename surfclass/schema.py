@@ -44,17 +44,25 @@ def validate(table: type[T], data: Mapping[str, Any], source: str) -> T:
         raise ConfigurationError("\n  ".join([f"{source}:", *lines])) from None
 
 
-def parse_toml(table: type[T], text: str | bytes, source: str) -> T:
-    """Returns the TOML `text` as a `table`; a syntax error names its line.
+def load_toml(text: str | bytes, source: str) -> dict[str, Any]:
+    """Returns what the TOML `text` says; a syntax error names its line.
 
     Raises:
-        ConfigurationError: As `validate`, and where the text is not UTF-8 or not TOML.
+        ConfigurationError: Where the text is not UTF-8 or not TOML.
     """
     try:
-        data = tomllib.loads(text.decode() if isinstance(text, bytes) else text)
+        return tomllib.loads(text.decode() if isinstance(text, bytes) else text)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{source}: not a TOML file: {error}") from None
-    return validate(table, data, source)
+
+
+def parse_toml(table: type[T], text: str | bytes, source: str) -> T:
+    """Returns the TOML `text` as a `table`.
+
+    Raises:
+        ConfigurationError: As `load_toml` and `validate`.
+    """
+    return validate(table, load_toml(text, source), source)
 
 
 def _fault(table: type[BaseModel], fault: Any) -> str:
