@@ -200,6 +200,17 @@ class DepthRig(Table):
                     f"rig {self.name} says {camera.size[0]} × {camera.size[1]}"
                 )
 
+    def whole(self) -> Rig:
+        """Returns the rig with its colour camera.
+
+        Raises:
+            MissingCalibrationError: If it has none.
+        """
+        raise MissingCalibrationError(
+            f"rig {self.name}: [rgb] is missing, and this step needs the colour camera; run the camera "
+            "calibration, or add [rgb] and transforms.rgb_T_depth to rig.toml"
+        )
+
     @property
     def _colour_camera(self) -> Camera | None:
         return None
@@ -232,6 +243,10 @@ class Rig(DepthRig):
                 "joint angles; run the hand-eye calibration, or give the captures their poses"
             )
         return Transform("flange", "depth", np.array(self.transforms.flange_T_depth))
+
+    def whole(self) -> Rig:
+        """Returns itself."""
+        return self
 
     @property
     def _colour_camera(self) -> Camera:
