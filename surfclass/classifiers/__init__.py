@@ -1,0 +1,1 @@
+"""Classifiers that turn features into class distributions, kept as plain arrays (appendix C)."""
