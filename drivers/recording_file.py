@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from drivers.recording_format import METADATA, SCHEMA, Entry, schemas
+from drivers.recording_format import METADATA, RIG, SCHEMA, Entry, schemas
 from surfclass.errors import InputError
 
 ACTIVE = ".active"
@@ -165,14 +165,12 @@ def described(metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> 
 
 
 def check_digests(record: Mapping[str, str], attachments: Mapping[str, bytes], source: str) -> None:
-    """Raises InputError where an attachment is missing or is not what was written."""
-    for key, digest in record.items():
-        if not key.startswith(_DIGEST):
-            continue
-        name = key.removeprefix(_DIGEST)
+    """Raises InputError where an attachment, the rig above all, is missing or is not what was written."""
+    digests = {key.removeprefix(_DIGEST): value for key, value in record.items() if key.startswith(_DIGEST)}
+    for name in (RIG, *digests):
         if name not in attachments:
             raise InputError(f"{source}: damaged: its {name} is missing")
-        if hashlib.sha256(attachments[name]).hexdigest() != digest:
+        if hashlib.sha256(attachments[name]).hexdigest() != digests.get(name):
             raise InputError(f"{source}: damaged: its {name} is not what was written")
 
 

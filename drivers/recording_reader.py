@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,10 +177,7 @@ class Recording:
 def reading(path: Path) -> Iterator[IO[bytes]]:
     """Opens the file; whatever goes wrong while it is read becomes an InputError that says what to do."""
     try:
-        with path.open("rb") as file:
-            yield file
-    except InputError:
-        raise
+        file = path.open("rb")
     except FileNotFoundError:
         active = path.with_name(path.name + ACTIVE)
         hint = f"; its writer did not finish: run `surfclass recover {active}`" if active.exists() else ""
@@ -188,7 +186,14 @@ def reading(path: Path) -> Iterator[IO[bytes]]:
         raise InputError(f"{path}: a folder; turn it into a recording with `surfclass import`") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        with file:
+            yield file
+    except InputError:
+        raise
     except Exception as error:
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: a seek to before the file
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         # The parsers below raise anything from struct.error to RuntimeError on damaged bytes.
         raise InputError(
             f"{path}: damaged ({type(error).__name__}: {error}); `surfclass recover {path}` saves the "

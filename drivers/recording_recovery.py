@@ -12,7 +12,7 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metada
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from drivers.recording_file import ACTIVE, RecordingFile, check_digests, own_keys
-from drivers.recording_format import CAPTURE, IMAGES, JOINTS, MAP, MAP_SCHEMA, RIG, Entry, parse_record
+from drivers.recording_format import CAPTURE, IMAGES, JOINTS, MAP, MAP_SCHEMA, Entry, parse_record
 from drivers.recording_reader import RECORD_LIMIT, Recording, check_is_mcap, check_record, reading
 from surfclass.errors import InputError
 
@@ -114,10 +114,6 @@ class _Salvage:
     def _begun(self) -> RecordingFile:
         if self._out is None:
             record = check_record(self._records, (), self._path)
-            if RIG not in self._attachments:
-                raise InputError(
-                    f"{self._path}: broke off before its {RIG} was written; there is nothing to recover"
-                )
             check_digests(record, self._attachments, str(self._path))
             partial = self._target.with_name(self._target.name + ".recovering")
             partial.unlink(missing_ok=True)  # of a recovery that was killed
