@@ -55,6 +55,9 @@ class NormalSettings:
             )
 
 
+DEFAULT_SETTINGS = NormalSettings()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Normals:
     """The normals of a depth image.
@@ -70,7 +73,7 @@ class Normals:
 
 
 def estimate_normals(
-    depth_mm: NDArray[Any], camera: Camera, settings: NormalSettings = NormalSettings()
+    depth_mm: NDArray[Any], camera: Camera, settings: NormalSettings = DEFAULT_SETTINGS
 ) -> Normals:
     """Fits a plane around every reading (Eq. 3.6's PCA, done where the noise is even).
 
