@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from surfclass.classifiers.coupling import couple_planes
 from surfclass.classifiers.folds import HeldOut, deal_folds, thin_out
 from surfclass.classifiers.platt import fit_sigmoid, sigmoid
+from surfclass.classifiers.samples import check_features, check_samples
 from surfclass.errors import InputError
 from surfclass.types import Float32, Float64, freeze
 
@@ -86,7 +87,7 @@ class Svm:
         Raises:
             InputError: If x has another shape or holds a number that is not finite.
         """
-        z = (_features(x, self.mean.size) - self.mean) / self.scale
+        z = (check_features(x, self.mean.size) - self.mean) / self.scale
         if self.kernel == "linear":
             return z @ self.coefficient.T + self.intercept
         f = np.empty((len(z), len(self.intercept)))
@@ -221,11 +222,13 @@ def train(
         InputError: If the shapes differ, a feature is not finite, a label is out of range, a class has
             fewer than two samples, or a parameter is out of range.
     """
-    x, y = _samples(x, label, groups, names)
+    x, y = check_samples(x, label, names)
     if kernel not in ("rbf", "linear") or not (C > 0 and gamma > 0 and folds >= 2):
         raise InputError(f"SVM: kernel {kernel!r}, C {C}, gamma {gamma}, folds {folds}; "
                          "allowed are rbf or linear, positive C and gamma, at least 2 folds")  # fmt: skip
     groups = np.asarray(groups)
+    if groups.shape != y.shape:
+        raise InputError(f"training set: groups of shape {groups.shape} for {len(y)} samples")
     chosen = thin_out(y, groups, most_samples, seed)
     x, y, groups = x[chosen], y[chosen], groups[chosen]
     fold, held_out = deal_folds(y, groups, folds, seed)
@@ -273,32 +276,3 @@ def _fit_pairs(
     if kernel == "linear":
         return support[:0], coefficient @ support, intercept
     return support, coefficient, intercept
-
-
-def _features(x: NDArray[np.floating], d: int) -> Float64:
-    features = np.asarray(x, dtype=np.float64)
-    if features.ndim != 2 or features.shape[1] != d:
-        raise InputError(f"features: shape {features.shape}, must be (n, {d})")
-    if not np.isfinite(features).all():
-        raise InputError("features: a number is not finite")
-    return features
-
-
-def _samples(
-    x: NDArray[np.floating], label: NDArray[np.integer], groups: NDArray[Any], names: Sequence[str] | None
-) -> tuple[Float64, NDArray[np.intp]]:
-    features = _features(x, np.shape(x)[-1] if np.ndim(x) else 0)
-    y = np.asarray(label)
-    n = len(features)
-    if y.shape != (n,) or np.shape(groups) != (n,) or not n:
-        raise InputError(
-            f"training set: {n} samples, labels {y.shape}, groups {np.shape(groups)}; must be (n,)"
-        )
-    if not np.issubdtype(y.dtype, np.integer) or y.min() < 0 or (names and y.max() >= len(names)):
-        raise InputError(f"training set: labels of {y.dtype} from {y.min()} to {y.max()}, must count from 0")
-    count = np.bincount(y, minlength=len(names) if names else 2)
-    for k in np.flatnonzero(count < 2).tolist():
-        raise InputError(
-            f"training set: class {names[k] if names else k} has {count[k]} samples, needs at least 2"
-        )
-    return features, y.astype(np.intp)
