@@ -47,8 +47,8 @@ def _flat(patch: Patch, albedo: tuple[float, float, float]) -> Float32:
 
 def _tint(patch: Patch, spread: float) -> Float32:
     """(3,) Two pieces of one material never have quite the same colour."""
-    draw = stream(patch.seed, patch.key, "tint").standard_normal(3)
-    return np.asarray(1 + spread * draw, dtype=np.float32)
+    draw = stream(patch.seed, patch.key, "tint").standard_normal(4)
+    return np.asarray(1 + spread * (draw[0] + 0.5 * draw[1:]), dtype=np.float32)
 
 
 def _rusted(patch: Patch) -> Look:
@@ -61,8 +61,8 @@ def _rusted(patch: Patch) -> Look:
     albedo = mix(albedo, (0.330, 0.148, 0.055), 0.85 * step(fresh + 0.3 * fine, 0.4, 1.5))
     pale = step(scale + 0.25 * fine, 1.0, 1.45)
     albedo = mix(albedo, (0.330, 0.232, 0.165), 0.9 * pale)
-    bare = step(patch.fractal("bare", 0.050, 6, 0.6) + 0.2 * fine, 1.75, 2.0)
-    albedo = mix(albedo, (0.300, 0.270, 0.250), 0.8 * bare)
+    bare = step(patch.fractal("bare", 0.050, 6, 0.6) + 0.2 * fine, 1.95, 2.25)
+    albedo = mix(albedo, (0.315, 0.270, 0.240), 0.8 * bare)
     albedo *= np.exp(np.float32(0.11) * fine + np.float32(0.10) * patch.noise("speck", 0.0007))[..., None]
     height = 1.6e-4 * blotch - 3.0e-4 * pale + 7.5e-5 * fine + 2.6e-5 * patch.noise("pit", 0.0009)
     return albedo * _tint(patch, 0.03), height.astype(np.float32)
@@ -85,8 +85,9 @@ def _painted(patch: Patch) -> Look:
     chalk = patch.fractal("chalk", 0.150, 6, 0.55)
     brush = patch.noise("brush", 0.060, 0.0022)
     dirt = step(patch.fractal("dirt", 0.045, 6, 0.6) + 0.4 * chalk, 1.2, 2.6)
-    spot = step(patch.noise("spot", 0.011), 2.35, 2.75)
-    halo = step(patch.noise("spot", 0.011) + 0.15 * patch.noise("halo", 0.002), 1.75, 2.6)
+    blister = patch.noise("spot", 0.011) + 0.28 * patch.fractal("ragged", 0.0045, 4, 0.7)
+    spot = step(blister, 2.40, 2.65)
+    halo = step(blister, 1.80, 2.65)
     albedo = _flat(patch, (0.245, 0.385, 0.335))
     albedo = mix(albedo, (0.345, 0.440, 0.400), 0.45 * step(chalk, -0.4, 2.0))
     albedo = mix(albedo, (0.235, 0.255, 0.205), 0.55 * dirt)
@@ -113,7 +114,7 @@ def _timber(patch: Patch) -> Look:
     fibre = patch.noise("fibre", 0.030, 0.0008) + 0.6 * patch.noise("fibre2", 0.012, 0.0005)
     pores = step(patch.noise("pores", 0.009, 0.0006), 1.7, 2.4)
     albedo = _flat(patch, (0.565, 0.388, 0.240))
-    albedo = mix(albedo, (0.425, 0.262, 0.142), 0.72 * late)
+    albedo = mix(albedo, (0.425, 0.262, 0.142), 0.85 * late)
     albedo = mix(albedo, (0.475, 0.352, 0.250), 0.6 * step(patch.fractal("grey", 0.160, 5), 0.3, 1.9))
     albedo = mix(albedo, (0.235, 0.132, 0.075), 0.85 * step(knot, 0.45, 0.95))
     albedo *= np.exp(np.float32(0.055) * fibre - np.float32(0.18) * pores)[..., None]

@@ -205,11 +205,12 @@ def _checkerboard() -> Scene:
         _Look(f"corner_{index}", (x, y, z + up), 0.72, 10.0 * (-1) ** index, 8.0)
         for index, (y, up) in enumerate(places)
     ]
-    return Scene("checkerboard", (*_box(board, 0.004), _wall()), tuple(looks))
+    return Scene("checkerboard", (*_box(board, 0.004, ("white",)), _wall()), tuple(looks))
 
 
 def _reflector_discs() -> Scene:
-    centre = (BOARD_X_M, 0.0, 0.70)
+    centre = (BOARD_X_M, 0.0, 0.66)
+    aim = (BOARD_X_M, 0.0, 0.76)  # above it: the depth camera, which is to see it whole, looks lower
     plate = _upright(
         "plate",
         centre,
@@ -219,13 +220,13 @@ def _reflector_discs() -> Scene:
     )
     tilts = (
         (0, 0, 0), (22, 0, 15), (-22, 0, -15), (0, 22, 0), (0, -20, 10), (18, 16, -10), (-18, 16, 20),
-        (18, -16, 0), (-18, -14, -20), (30, 5, 8), (-30, 5, -8), (8, 24, 12), (0, 0, 30), (12, -8, -25),
+        (18, -16, 0), (-18, -14, -20), (30, 5, 8), (-30, 5, -8), (8, 16, 12), (0, 0, 30), (12, -8, -25),
     )  # fmt: skip
     looks = tuple(
-        _Look(f"tilt_{index:02d}", centre, 0.85 + 0.03 * (index % 7), turn, rise, roll)
+        _Look(f"tilt_{index:02d}", aim, 0.85 + 0.03 * (index % 7), turn, rise, roll)
         for index, (turn, rise, roll) in enumerate(tilts)
     )
-    return Scene("reflector_discs", (*_box(plate, 0.006), _wall()), looks)
+    return Scene("reflector_discs", (*_box(plate, 0.006, ("plate",)), _wall()), looks)
 
 
 def _grey_card() -> Scene:
