@@ -49,9 +49,17 @@ class TestEveryDevice:
         assert not device.is_open
 
     def test_is_a_context_manager_that_closes_on_errors(self, bench, kind):
-        with pytest.raises(KeyError), bench.device(kind) as device:
-            assert device.is_open
-            raise KeyError
+        device = bench.device(kind)
+        opened = []
+
+        def fail_inside():
+            with device:
+                opened.append(device.is_open)
+                raise KeyError
+
+        with pytest.raises(KeyError):
+            fail_inside()
+        assert opened == [True]
         assert not device.is_open
 
     def test_a_closed_device_refuses_with_a_driver_error(self, bench, kind):
