@@ -1,0 +1,249 @@
+"""Diffuse reflectance K_d: the colour of a surface without the light's distance and angle."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surfclass.errors import InputError, MissingCalibrationError
+from surfclass.geometry import rays
+from surfclass.rig import Camera, Light, Response, Rig
+from surfclass.types import Bool, Float32, Float64, SurfaceView, freeze
+
+UNDER_EXPOSED = 0.02
+"""Fraction of full scale at and below which a channel says nothing but noise."""
+OVER_EXPOSED = 0.98
+"""Fraction of full scale at and above which a channel is saturated."""
+LEAST_LIGHT_COSINE = 0.5
+"""The model holds for incidence angles up to 60° (thesis 6.4)."""
+
+_SAME_EXPOSURE = 0.01
+_LEVELS = 65536
+
+
+def fit_distance_polynomial(
+    distance_m: NDArray[Any], intensity: NDArray[Any], reference_m: float
+) -> tuple[float, float, float]:
+    """Fits Eq. 4.4's `1 / I ∝ a2 d² + a1 d + a0` to a Lambertian target lit straight on.
+
+    Least squares of 1/I, weighted by I: a relative error counts alike at every distance; unweighted,
+    the darkest samples rule.
+
+    Args:
+        distance_m: (n,) from the light, at least three different ones.
+        intensity: (n,) fractions of full scale, positive.
+        reference_m: Where the polynomial is scaled to 1.
+
+    Returns:
+        a2, a1, a0 for metres.
+
+    Raises:
+        InputError: If the samples do not determine a polynomial that is positive between them.
+    """
+    d, i = np.asarray(distance_m, np.float64), np.asarray(intensity, np.float64)
+    if d.shape != i.shape or d.ndim != 1 or not (np.isfinite(d).all() and np.isfinite(i).all()):
+        raise InputError(f"distance polynomial: shapes {d.shape} and {i.shape}, allowed are n finite pairs")
+    if np.unique(d).size < 3 or i.min() <= 0 or d.min() <= 0:
+        raise InputError("distance polynomial: needs positive intensities at 3 or more different distances")
+    powers = np.stack([d * d, d, np.ones_like(d)], axis=1)
+    coefficients = np.linalg.lstsq(powers * i[:, None], np.ones_like(d), rcond=None)[0]
+    between = np.linspace(min(d.min(), reference_m), max(d.max(), reference_m), 101)
+    if np.polyval(coefficients, between).min() <= 0:
+        raise InputError(
+            f"distance polynomial: the fit to {d.size} samples is not positive from {between[0]:.3f} to "
+            f"{between[-1]:.3f} m; the samples are too noisy, or too far from the reference {reference_m} m"
+        )
+    a2, a1, a0 = coefficients / np.polyval(coefficients, reference_m)
+    return float(a2), float(a1), float(a0)
+
+
+def well_exposed(fraction: Float32) -> Bool:
+    """Returns (h, w): no channel of the (3, h, w) fractions is under- or over-exposed."""
+    low = np.minimum(np.minimum(fraction[0], fraction[1]), fraction[2])
+    high = np.maximum(np.maximum(fraction[0], fraction[1]), fraction[2])
+    good: Bool = (low > UNDER_EXPOSED) & (high < OVER_EXPOSED)
+    return good
+
+
+def diffuse_reflectance(
+    fraction: Float32,
+    view: SurfaceView,
+    rig: Rig,
+    mode: Literal["thesis", "full"],
+    exposure_ratio: float = 1.0,
+) -> tuple[Float32, Bool]:
+    """Returns K_d of every pixel and channel.
+
+    "thesis" is Eq. 4.12, `K_d = I (a2 d² + a1 d + a0) / cos θ_l`. Its polynomial stands for the camera's
+    response too, which acts on the whole irradiance and not on the distance alone, so that it is wrong
+    off the normal. "full" is `K_d = g⁻¹(I) d² / (cos θ_l · led · vignetting)`.
+
+    Args:
+        fraction: (3, h, w) intensities, fractions of full scale.
+        view: The geometry of the same pixels.
+        rig: Its light, response and vignetting.
+        mode: Which of the two.
+        exposure_ratio: Reference exposure time over this image's.
+
+    Returns:
+        (3, h, w) float32, 0 where not valid; and (h, w) bool: False where there is no normal, where
+        θ_l exceeds 60°, where the light does not shine, or where any channel is badly exposed.
+
+    Raises:
+        MissingCalibrationError: Naming what of the rig is missing.
+        InputError: If the shapes differ, the mode is unknown, or "thesis" is to mix exposures.
+    """
+    if fraction.shape != (3, *view.has_point.shape):
+        raise InputError(f"K_d: planes {fraction.shape} for a view of {view.has_point.shape} pixels")
+    if rig.light is None or view.light_distance_m is None or view.light_cosine is None:
+        raise _missing(rig, "light.position_rgb_m", "the light calibration")
+    d, cosine = view.light_distance_m, view.light_cosine
+    valid: Bool = view.has_normal & (cosine >= LEAST_LIGHT_COSINE) & well_exposed(fraction)
+    if mode == "thesis":
+        if abs(exposure_ratio - 1) > _SAME_EXPOSURE:
+            raise InputError(
+                f"K_d: exposure ratio {exposure_ratio:g}; Eq. 4.12's polynomial holds at one exposure only, "
+                "the full model scales"
+            )
+        return _by_polynomial(fraction, d, cosine, valid, rig), valid
+    if mode == "full":
+        return _by_full_model(fraction, view, d, cosine, valid, rig, exposure_ratio), valid
+    raise InputError(f"K_d: mode {mode!r}, allowed are 'thesis' and 'full'")
+
+
+def _missing(rig: Rig, what: str, how: str) -> MissingCalibrationError:
+    return MissingCalibrationError(f"rig {rig.name}: {what} is missing, K_d needs it; run {how}")
+
+
+def _by_polynomial(fraction: Float32, d: Float32, cosine: Float32, valid: Bool, rig: Rig) -> Float32:
+    if rig.response is None or rig.response.a2_a1_a0 is None:
+        raise _missing(rig, "response.a2_a1_a0", "the response calibration")
+    inverse = np.divide(1, cosine, out=np.zeros_like(cosine), where=valid)
+    k_d = np.empty_like(fraction)
+    for channel, polynomial in enumerate(rig.response.a2_a1_a0):
+        a2, a1, a0 = (np.float32(a) for a in polynomial)
+        factor = d * a2
+        factor += a1
+        factor *= d
+        factor += a0
+        factor *= inverse
+        np.multiply(fraction[channel], factor, out=k_d[channel])
+    return k_d
+
+
+def _by_full_model(
+    fraction: Float32,
+    view: SurfaceView,
+    d: Float32,
+    cosine: Float32,
+    valid: Bool,
+    rig: Rig,
+    exposure_ratio: float,
+) -> Float32:
+    if rig.response is None or rig.response.inverse is None:
+        raise _missing(rig, "response.inverse", "the response calibration with an exposure series")
+    if rig.rgb.vignetting is None:
+        raise _missing(rig, "rgb.vignetting", "the light calibration")
+    light = rig.light
+    if light is None or light.axis_rgb is None or light.falloff_exponent is None:
+        raise _missing(rig, "light.axis_rgb and light.falloff_exponent", "the light calibration")
+    emission, shines = _emission(view.point, d, light)
+    valid &= shines
+    emission *= cosine
+    factor = np.divide(np.float32(exposure_ratio), emission, out=np.zeros_like(d), where=valid)
+    factor *= d
+    factor *= d
+    factor *= _inverse_vignetting(rig.rgb)
+    k_d = np.empty_like(fraction)
+    for channel, table in enumerate(_linear_tables(rig.response.inverse)):
+        level = (fraction[channel] * np.float32(_LEVELS - 1) + np.float32(0.5)).astype(np.uint16)
+        np.multiply(table[level], factor, out=k_d[channel])
+    return k_d
+
+
+def _emission(point: Float32, d: Float32, light: Light) -> tuple[Float32, Bool]:
+    """The LED's fall-off cos(ψ)^n towards each point, and where it shines at all."""
+    axis = np.array(light.axis_rgb, np.float32)
+    towards = np.einsum("i,ihw->hw", axis, point)
+    towards -= np.float32(axis @ np.array(light.position_rgb_m, np.float32))
+    shines = towards > 0
+    cosine = np.divide(towards, d, out=np.zeros_like(d), where=shines & (d > 0))
+    exponent = light.falloff_exponent
+    if exponent != 1:
+        np.power(cosine, np.float32(exponent), out=cosine)
+    return cosine, shines
+
+
+@lru_cache(maxsize=4)
+def _inverse_vignetting(camera: Camera) -> Float32:
+    x, y = rays(camera).astype(np.float64)
+    r2 = x * x + y * y
+    v2, v4, v6 = camera.vignetting or (0.0, 0.0, 0.0)
+    relative = 1 + r2 * (v2 + r2 * (v4 + r2 * v6))
+    if relative.min() <= 0:
+        raise InputError(
+            f"rgb.vignetting {camera.vignetting}: the relative illumination falls to {relative.min():.3f} "
+            "in the image, allowed is above 0"
+        )
+    return freeze((1 / relative).astype(np.float32))
+
+
+@lru_cache(maxsize=4)
+def _linear_tables(inverse: tuple[tuple[float, ...], ...]) -> Float32:
+    """(3, 65536): g⁻¹ at every 16-bit intensity, which 8- and 16-bit images hit exactly."""
+    return freeze(
+        np.stack([_linear(np.linspace(0, 1, _LEVELS), curve) for curve in inverse]).astype(np.float32)
+    )
+
+
+def _linear(intensity: Float64, curve: tuple[float, ...]) -> Float64:
+    """g⁻¹: irradiance of an intensity, both fractions of full scale."""
+    return np.interp(intensity, np.linspace(0, 1, len(curve)), curve)
+
+
+def subtract_dark(
+    lit: NDArray[Any], dark: NDArray[Any], response: Response | None
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Takes ambient light off an image: `g(g⁻¹(lit) − g⁻¹(dark))`, for light adds up before the response.
+
+    What is over-exposed in `lit` keeps its value, so that it is still known to be.
+
+    Args:
+        lit: (h, w, 3) uint8 or uint16, the LED on.
+        dark: The same view and exposure, the LED off.
+        response: The camera's; its `inverse` is needed.
+
+    Raises:
+        MissingCalibrationError: If `response.inverse` is missing.
+        InputError: If the images differ in shape or type.
+    """
+    if response is None or response.inverse is None:
+        raise MissingCalibrationError(
+            "response.inverse is missing: an unlit frame can be taken off in linear light only; run the "
+            "response calibration with an exposure series"
+        )
+    if lit.shape != dark.shape or lit.dtype != dark.dtype or lit.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"dark image: {dark.dtype} {dark.shape}, the lit one is {lit.dtype} {lit.shape}; "
+            "allowed is the same shape and type, uint8 or uint16"
+        )
+    full = np.iinfo(lit.dtype).max
+    levels = np.linspace(0, 1, full + 1)
+    result = np.empty_like(lit)
+    for channel, curve in enumerate(response.inverse):
+        linear = _linear(levels, curve)
+        knots = np.linspace(0, 1, len(curve))
+        if lit.dtype == np.uint8:
+            left = np.maximum(linear[:, None] - linear[None, :], 0)
+            table = np.rint(np.interp(left, curve, knots) * full).astype(lit.dtype)
+            table[levels >= OVER_EXPOSED] = np.nonzero(levels >= OVER_EXPOSED)[0][:, None]
+            result[..., channel] = table[lit[..., channel], dark[..., channel]]
+        else:
+            left = np.maximum(linear[lit[..., channel]] - linear[dark[..., channel]], 0)
+            taken_off = np.rint(np.interp(left, curve, knots) * full).astype(lit.dtype)
+            saturated = lit[..., channel] >= OVER_EXPOSED * full
+            result[..., channel] = np.where(saturated, lit[..., channel], taken_off)
+    return result
