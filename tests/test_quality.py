@@ -158,8 +158,10 @@ def test_the_map_is_each_pixels_probability_for_its_own_class() -> None:
 
 def test_pixels_without_a_normal_have_no_probability() -> None:
     distance, cosine = np.full((2, 2), 0.65), np.array([[1, 0], [1, 1]])
-    ours = quality.probability_map(view_of(distance, cosine), [TextureLimits()], np.ones((2, 2), np.uint8))
-    assert ours.tolist() == [[1, 0], [1, 1]]
+    any_angle = [TextureLimits(angle_rad=1.5, slope_per_rad=1.0)]
+    ours = quality.probability_map(view_of(distance, cosine), any_angle, np.ones((2, 2), np.uint8))
+    assert ours[0, 1] == 0
+    assert (ours > 0.5).sum() == 3
 
 
 def test_the_map_can_ask_for_focus_by_the_plane() -> None:
