@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from types import TracebackType
 from typing import Literal, Self
@@ -165,13 +164,16 @@ class SensorPackage:
         """
         self._must_be_open()
         readings = [self.read_joints()]
-        with self._lit() as (lit_ns, off_ns):
+        try:
+            lit_ns = self._light_on()
             colour = self._grab_colour(lit_ns)
             depth = self._grab_depth(lit_ns)
             readings.append(self.read_joints())
+        finally:
+            off_ns = self._light_off()
         dark = None
         if with_dark:
-            dark = self._grab_colour(off_ns[0])
+            dark = self._grab_colour(off_ns)
             readings.append(self.read_joints())
         skew_ns = depth.t_ns - colour.t_ns
         if abs(skew_ns) > self.settings.max_skew_s * 1e9:
@@ -205,28 +207,21 @@ class SensorPackage:
             if not device.is_open:
                 raise DeviceLostError(device.name, "it is not open")
 
-    @contextmanager
-    def _lit(self) -> Iterator[tuple[int, list[int]]]:
-        """Turns the light on, and off whatever happens.
+    def _light_on(self) -> int:
+        """Returns the time from which frames are lit as they should be."""
+        if self._light is None:
+            return self._clock.now_ns()
+        return self._set_light(self._light, self.settings.light_level)
 
-        Yields:
-            The time from which it shines, and a list that has the time from which it is dark once the
-            block has ended.
-        """
-        light, off_ns = self._light, list[int]()
-        if light is None:
-            now_ns = self._clock.now_ns()
-            yield now_ns, off_ns
-            off_ns.append(self._clock.now_ns())
-            return
+    def _light_off(self) -> int:
+        """Returns the time from which it is dark; a light that does not obey is closed, too."""
+        if self._light is None:
+            return self._clock.now_ns()
         try:
-            yield self._set_light(light, self.settings.light_level), off_ns
-        finally:
-            try:
-                off_ns.append(self._set_light(light, 0.0))
-            except BaseException:
-                light.close()  # the last thing that can be tried: close() leaves a light off
-                raise
+            return self._set_light(self._light, 0.0)
+        except BaseException:
+            self._light.close()  # the last thing that can be tried: close() leaves a light off
+            raise
 
     def _set_light(self, light: Light, level: float) -> int:
         holds_ns = light.set_level(level)
