@@ -21,6 +21,10 @@ from surfclass.frames import Capture
 
 _log = logging.getLogger("surfclass.acquisition")
 
+# A jumping clock returns at once where ours waits. An arm on its way is followed as fast as that goes;
+# after so many polls without a capture there is nothing to follow, and they take their real time.
+_FAST_POLLS = 200
+_REPEAT_S = 10.0  # the same reason for rejections is logged again after this
 POLL_S = 0.1  # the longest wait inside the source, and so the longest a request or a stop waits for it
 
 
@@ -54,8 +58,6 @@ class Acquisition:
         shots: Where captures go.
         dark: Whether to take an unlit frame where the request does not say.
         finite: Whether the source is a recording, which cannot be opened again after a fault.
-        idle: Whether a simulated world has nothing more to do, so that its jumping clock must not
-            keep the processor busy.
         jump: Lets a jumping clock pass while a lost device is waited for; None: the clock is ours.
         backoff: The waits between attempts to open.
     """
@@ -68,19 +70,21 @@ class Acquisition:
         *,
         dark: bool = False,
         finite: bool = False,
-        idle: Callable[[], bool] = lambda: True,
         jump: Callable[[float], None] | None = None,
         backoff: Backoff | None = None,
     ) -> None:
         self._source, self._requests, self._shots = source, requests, shots
         self.dark = dark
-        self._finite, self._idle, self._jump = finite, idle, jump
+        self._finite, self._jump = finite, jump
         self._backoff = backoff or Backoff()
         self._stop = threading.Event()
         self._retry = threading.Event()
         self._thread = threading.Thread(target=self._run, name="acquisition", daemon=True)
         self._beat_s = time.monotonic()
         self._names: set[str] = set()
+        self._rejection, self._rejection_told_s = "", 0.0
+        self._numbered = 0
+        self._successor: Callable[[int], CaptureSource] | None = None
         self.settled = threading.Event()
         self.phase = Phase.OPENING
         self.detail = ""
@@ -99,6 +103,17 @@ class Acquisition:
         """Clears a fault: the devices are opened again."""
         self._retry.set()
 
+    def replace(self, make: Callable[[int], CaptureSource], dark: bool) -> None:
+        """Goes on with another source of the same devices, after the capture under way.
+
+        Args:
+            make: Returns the source; its argument is the number of the next capture without a name.
+            dark: As for the first one.
+        """
+        self.dark = dark
+        self._successor = make
+        self._retry.set()
+
     @property
     def alive(self) -> bool:
         """Whether the thread still runs."""
@@ -114,6 +129,7 @@ class Acquisition:
             while not self._stop.is_set() and self.phase is not Phase.FINISHED:
                 try:
                     self._open_and_work()
+                    self._source.close()
                 except (DriverError, InputError) as error:
                     self._source.close()
                     if not self._recover(error):
@@ -126,6 +142,9 @@ class Acquisition:
 
     def _open_and_work(self) -> None:
         self._beat()
+        if self._successor is not None:
+            make, self._successor = self._successor, None
+            self._source = make(self._numbered + 1)
         self._source.open()
         if self._backoff.attempts:
             self.counts["reopened"] += 1
@@ -133,17 +152,20 @@ class Acquisition:
         self.phase, self.detail = Phase.RUNNING, ""
         log(_log, logging.INFO, "source open", source=self._source.name)
         self.settled.set()
-        while not self._stop.is_set():
+        fruitless = 0
+        while not self._stop.is_set() and self._successor is None:
             self._beat()
             start = time.monotonic()
             shot = self._next()
+            fruitless += 1
             if shot is not None:
+                fruitless = 0
                 self._deliver(shot)
             elif self._source.finished:
                 self.phase = Phase.FINISHED
                 self._requests.close(f"{self._source.name} is at its end")
                 return
-            elif self._idle():
+            elif fruitless > _FAST_POLLS:
                 self._stop.wait(max(0.0, POLL_S - (time.monotonic() - start)))
 
     def _next(self) -> Shot | None:
@@ -159,28 +181,45 @@ class Acquisition:
             wanted = CaptureRequest(name=name, with_dark=self.dark if dark is None else dark)
         start = time.monotonic()
         try:
-            try:
-                capture = self._source.next(POLL_S, wanted)
-            except DriverError as error:
-                if remedy(error) is not Remedy.RETRY:
-                    raise
-                self._note(error, "trying once more")
-                self._beat()
-                capture = self._source.next(POLL_S, wanted)
+            capture = self._twice(wanted)
         except CaptureRejectedError as error:
-            self.counts["rejected"] += 1
-            log(_log, logging.WARNING, "capture rejected", reason=error)
-            if request is not None:
-                self._requests.take(request)
-                request.refuse(f"capture rejected: {error}")
+            self._reject(request, error)
             return None
         if request is not None and (capture is not None or self._source.finished):
             self._requests.take(request)
         if capture is None:
             return None
         self._names.add(capture.name)
+        self._numbered += request is None or request.command.name is None
         self.counts["accepted"] += 1
         return Shot(capture, (time.monotonic() - start) * 1e3, request)
+
+    def _twice(self, wanted: CaptureRequest | None) -> Capture | None:
+        """Asks the source; where a device is silent, once more."""
+        try:
+            return self._source.next(POLL_S, wanted)
+        except DriverError as error:
+            if remedy(error) is not Remedy.RETRY:
+                raise
+            self._note(error, "trying once more")
+            self._beat()
+            if wanted is None and error.device != "arm":
+                # Only the arm is asked while nothing is due: a capture was under way, whose tick is past.
+                wanted = CaptureRequest(with_dark=self.dark)
+        return self._source.next(POLL_S, wanted)
+
+    def _reject(self, request: Request | None, error: CaptureRejectedError) -> None:
+        self.counts["rejected"] += 1
+        if request is not None:
+            self._requests.take(request)
+            request.refuse(f"capture rejected: {error}")
+        now_s = time.monotonic()
+        if error.reason != self._rejection or now_s >= self._rejection_told_s + _REPEAT_S:
+            self._rejection, self._rejection_told_s = error.reason, now_s
+            total = self.counts["rejected"]
+            log(_log, logging.WARNING, "capture rejected", reason=error.reason, error=error, total=total)
+        if request is None:
+            self._stop.wait(POLL_S)  # a source that rejects at once must not keep the processor busy
 
     def _deliver(self, shot: Shot) -> None:
         while True:

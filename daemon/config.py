@@ -81,11 +81,16 @@ class RecordingSettings(Table):
 
 
 class ZenohSettings(Table):
-    """How the map leaves the process; scouting is off, so only these endpoints count."""
+    """How the map leaves the process; scouting is off, so only these endpoints count.
+
+    Attributes:
+        settings: More of Zenoh's own configuration by its keys, such as `"transport/link/tls"`.
+    """
 
     mode: Literal["router", "peer", "client"] = "router"
     listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[Endpoint, ...] = ()
+    settings: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _reachable(self) -> ZenohSettings:

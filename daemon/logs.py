@@ -55,10 +55,14 @@ def under_journal(stream: IO[str]) -> bool:
 
 
 def configure(level: str = "info") -> None:
-    """Sends the project's logs to standard error, in the journal's form where that is the journal."""
+    """Sends all logs to standard error, in the journal's form where that is the journal.
+
+    May be called again, with another level. Libraries are only heard when something is wrong.
+    """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter(under_journal(sys.stderr)))
-    root = logging.getLogger("surfclass")
+    root = logging.getLogger()
     root.handlers[:] = [handler]
-    root.setLevel(level.upper())
-    root.propagate = False
+    root.setLevel(logging.WARNING)
+    for name in ("surfclass", "daemon", "drivers"):
+        logging.getLogger(name).setLevel(level.upper())

@@ -7,12 +7,13 @@ import time
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from service_fakes import Rig, capture
+from service_fakes import Rig, Source, capture
 
 from daemon import service as service_module
 from daemon.notify import Watchdog, notify
 from daemon.recovery import POLICY, Backoff, Remedy, remedy
 from daemon.requests import CommandError, RequestQueue
+from drivers.capture_source import CaptureRequest
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -273,6 +274,15 @@ def test_a_timeout_is_retried_once_and_then_as_lost(tmp_path):
     assert rig.acquisition.counts["device_errors"] == 3
 
 
+@pytest.mark.parametrize(("device", "asked_again"), [("colour", True), ("light", True), ("arm", False)])
+def test_a_capture_whose_tick_is_past_is_asked_for_again(tmp_path, device, asked_again):
+    with Rig(tmp_path, [DeviceTimeoutError(device, "silent"), capture("a")], dark=True) as rig:
+        rig.until(lambda: "publish 1" in rig.events)
+    first, second = rig.source.requests[:2]
+    assert first is None
+    assert second == (CaptureRequest(with_dark=True) if asked_again else None)
+
+
 def test_a_fault_is_not_retried_until_a_reload(tmp_path):
     with Rig(tmp_path, [DeviceFaultError("light", "over temperature")]) as rig:
         rig.until(lambda: rig.health() == "failed")
@@ -305,6 +315,35 @@ def test_a_rejected_capture_is_no_device_error(tmp_path):
         assert rig.health() == "ok"
     assert rig.acquisition.counts["rejected"] == 1
     assert rig.acquisition.counts["device_errors"] == 0
+
+
+def test_rejections_are_paced_and_logged_once(tmp_path, caplog):
+    stale = [CaptureRejectedError("the joint angles are old", "stale") for _ in range(50)]
+    with caplog.at_level("WARNING"), Rig(tmp_path, stale) as rig:
+        time.sleep(0.55)
+        rejected = rig.acquisition.counts["rejected"]
+    assert 2 <= rejected <= 8
+    assert len([record for record in caplog.records if "rejected" in record.message]) == 1
+
+
+def test_another_source_goes_on_with_the_numbers(tmp_path):
+    made = []
+
+    def make(first_number):
+        made.append(first_number)
+        source = Source([capture("from the new one")], rig.events)
+        return source
+
+    with Rig(tmp_path) as rig:
+        rig.service.capture({})
+        rig.service.capture({"name": "mine"})
+        rig.service.capture({})
+        rig.acquisition.replace(make, dark=True)
+        rig.until(lambda: "map from the new one" in rig.events)
+        assert not rig.source.is_open
+        assert rig.health() == "ok"
+    assert made == [3]
+    assert rig.acquisition.dark
 
 
 # ---- recording

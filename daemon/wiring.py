@@ -1,0 +1,376 @@
+"""Builds the service and its parts from the configuration; the only place that knows all of them."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import logging
+import os
+import queue
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import zenoh
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+from daemon import logs
+from daemon.acquisition import Acquisition, Shot
+from daemon.config import RELOADABLE, Config, SimSettings, TriggerSettings
+from daemon.files import read_file
+from daemon.notify import notify
+from daemon.publisher import MapPublisher
+from daemon.requests import RequestQueue
+from daemon.service import Service
+from daemon.sink import RecordingSink, run_stem
+from daemon.transport import MapMeta, TransportError, open_session
+from drivers import backends
+from drivers.capture_source import (
+    CaptureSource,
+    IntervalTrigger,
+    LiveSource,
+    RequestTrigger,
+    RestTrigger,
+    Trigger,
+)
+from drivers.clock import SystemClock
+from drivers.interfaces import Clock, Light
+from drivers.recording import Recording, RecordingWriter, unix_offset_ns
+from drivers.replay import RecordingSource
+from drivers.sensor_package import SensorPackage, SensorSettings
+from surfclass import map_pb2
+from surfclass.errors import ConfigurationError
+from surfclass.map_file import to_npz_bytes
+from surfclass.model import Model
+from surfclass.pipeline import Pipeline, PipelineSettings
+from surfclass.rig import Rig, SurfaceClasses, parse_rig
+from surfclass.wire import encode_update
+
+if TYPE_CHECKING:
+    from drivers.sim.world import SimWorld
+
+_log = logging.getLogger("surfclass.wiring")
+
+# Views of the place itself; boards and calibration targets stood elsewhere, at other times.
+MAP_ROLES = ("map", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class Sensors:
+    """The configured devices, closed, and the package that captures with all of them.
+
+    Attributes:
+        clock: Theirs; the host's, or the simulated world's.
+        devices: By kind.
+        package: Opens and closes all of them.
+        device_s: Timeout of one call.
+        world: The simulated world, or None.
+    """
+
+    clock: Clock
+    devices: dict[str, Any]
+    package: SensorPackage
+    device_s: float
+    world: SimWorld | None
+
+
+def build_sensors(config: Config) -> Sensors:
+    """Returns the configured devices; none is opened yet.
+
+    Raises:
+        ConfigurationError: If a backend or an option is unknown, or a needed device is missing.
+        DriverUnavailableError: If a vendor library is missing.
+    """
+    missing = [kind for kind in ("colour", "depth") if kind not in config.devices]
+    if missing:
+        raise ConfigurationError(f"no [{'] and no ['.join(missing)}] table: there is nothing to capture with")
+    clock: Clock = SystemClock()
+    world = build_world(config) if config.simulated else None
+    shared: dict[str, object] = {}
+    if world is not None:
+        clock, shared["sim"] = world.clock, world
+    devices: dict[str, Any] = {}
+    for kind, device in config.devices.items():
+        devices[kind] = backends.create(
+            kind, device.backend, name=kind, clock=clock, options=device.options, shared=shared
+        )
+    return Sensors(clock, devices, build_package(config, clock, devices), config.limits.device_s, world)
+
+
+def build_package(config: Config, clock: Clock, devices: Mapping[str, Any]) -> SensorPackage:
+    """Returns the sensor package of these devices, which takes captures as configured."""
+    seconds = config.limits.device_s
+    settings = SensorSettings(
+        light_level=config.capture.level,
+        colour_timeout_s=seconds,
+        depth_timeout_s=seconds,
+        joints_timeout_s=seconds,
+    )
+    light, arm = devices.get("light"), devices.get("arm")
+    return SensorPackage(clock, devices["colour"], devices["depth"], light, arm, settings)
+
+
+def build_world(config: Config) -> SimWorld:
+    """Returns the simulated world of [sim], its arm about to visit the scene's viewpoints.
+
+    Raises:
+        ConfigurationError: If the scene, a number or a fault cannot be.
+    """
+    from drivers.sim import scenes
+    from drivers.sim.clock import SimClock
+    from drivers.sim.faults import Fault, Faults
+    from drivers.sim.world import SimWorld
+
+    sim = config.sim or SimSettings()
+    faults = [Fault(**fault.model_dump(exclude_none=True)) for fault in sim.faults]
+    return SimWorld(
+        sim.scene,
+        sim.seed,
+        SimClock(sim.realtime),
+        Faults(tuple(faults)),
+        scale=sim.scale,
+        program=scenes.viewpoints(sim.scene)[: sim.viewpoints],
+        ambient=sim.ambient,
+    )
+
+
+def build_pipeline(config: Config) -> Pipeline:
+    """Returns the pipeline of the configured rig, or of the replayed recording's, and the model.
+
+    Raises:
+        InputError: If a file cannot be read.
+        ConfigurationError: If one is not valid, or they do not fit each other.
+    """
+    rig = rig_of(config)[1]
+    model = Model.from_bytes(read_file(config.model, "model"), str(config.model))
+    return Pipeline(rig, model, PipelineSettings(config.pipeline.update, config.pipeline.pool))
+
+
+def rig_of(config: Config) -> tuple[str, Rig]:
+    """Returns the text of the rig and the rig: the recording's own where one is replayed.
+
+    Raises:
+        InputError, ConfigurationError: As `build_pipeline`.
+    """
+    if config.replay is not None:
+        recording = Recording.open(config.replay)
+        return recording.rig_text, recording.rig
+    if config.rig is None:
+        raise ConfigurationError("rig is missing (only a replayed recording brings its own)")
+    data = read_file(config.rig, "rig")
+    return data.decode(errors="replace"), parse_rig(data, str(config.rig))
+
+
+def build_trigger(settings: TriggerSettings) -> Trigger:
+    """Returns the configured trigger; requests are taken with every one of them."""
+    if settings.rest is not None:
+        return RestTrigger(settings.rest.rest_s, settings.rest.still_rad, settings.rest.moved_rad)
+    return RequestTrigger() if settings.interval_s is None else IntervalTrigger(settings.interval_s)
+
+
+def build_source(config: Config, sensors: Sensors, first_number: int = 1) -> LiveSource:
+    """Returns the sensors as a source of captures, triggered as configured."""
+    return LiveSource(
+        build_package(config, sensors.clock, sensors.devices),
+        build_trigger(config.trigger),
+        sensors.clock,
+        with_dark=config.capture.dark,
+        first_number=first_number,
+    )
+
+
+def open_zenoh(config: Config) -> zenoh.Session:
+    """Returns the session of [zenoh].
+
+    Raises:
+        ConfigurationError: If a setting is not one.
+        TransportError: If an endpoint cannot be reached or listened on.
+    """
+    told = config.zenoh
+    listen = () if told.mode == "client" else told.listen
+    return open_session(told.mode, listen, told.connect, told.settings)
+
+
+def build_sink(config: Config, pipeline: Pipeline, simulated: bool) -> RecordingSink | None:
+    """Returns where captures are kept; None where they are not, or come from a recording anyway.
+
+    Raises:
+        ConfigurationError: If the folder cannot be made.
+    """
+    if config.recording is None or config.replay is not None:
+        return None
+    told, stem = config.recording, run_stem(config.robot)
+    try:
+        told.directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"recording.directory {told.directory}: {error.strerror}") from None
+    rig_text, classes_text = rig_of(config)[0], classes_toml(pipeline.model.classes)
+    metadata = {
+        "robot": config.robot,
+        "run": stem,
+        "epoch": pipeline.map.epoch,
+        "software": f"surfclass {_version()}",
+        "model_sha256": hashlib.sha256(read_file(config.model, "model")).hexdigest(),
+    }
+    schema = FileDescriptorSet()
+    map_pb2.DESCRIPTOR.CopyToProto(schema.file.add())
+
+    def begin(path: Path, part: int) -> RecordingWriter:
+        return RecordingWriter(
+            path,
+            rig_text,
+            classes_text,
+            {**metadata, "part": str(part)},
+            # A simulated clock's times are nobody's Unix times.
+            unix_offset_ns=0 if simulated else unix_offset_ns(),
+            map_schema=schema.SerializeToString(deterministic=True),
+        )
+
+    return RecordingSink(told.directory, stem, begin, told.part_mb << 20, told.min_free_mb << 20)
+
+
+def build_service(
+    config: Config,
+    session: zenoh.Session,
+    *,
+    load: Callable[[], Config] | None = None,
+    exit_when_done: bool = False,
+) -> Service:
+    """Returns the service, wired and not started.
+
+    Args:
+        config: What to build.
+        session: An open Zenoh session; it stays the caller's to close.
+        load: Reads the configuration again on a reload; None: a reload only clears faults.
+        exit_when_done: Stop at the end of the replayed recording.
+
+    Raises:
+        InputError, ConfigurationError: If anything cannot be used as it stands.
+        DriverUnavailableError: If a vendor library is missing.
+    """
+    if config.map is not None and not config.map.parent.is_dir():
+        raise ConfigurationError(f"map: there is no folder {config.map.parent}")
+    pipeline = build_pipeline(config)
+    sensors = build_sensors(config) if config.replay is None else None
+    world = None if sensors is None else sensors.world
+    sink = build_sink(config, pipeline, simulated=world is not None)
+    requests = RequestQueue(config.limits.waiting_requests, config.limits.request_s)
+    shots: queue.Queue[Shot] = queue.Queue(config.limits.waiting_captures)
+    source: CaptureSource
+    if sensors is None:
+        assert config.replay is not None
+        source = RecordingSource(config.replay, SystemClock(), roles=MAP_ROLES)
+    else:
+        source = build_source(config, sensors)
+    jump = world.clock.sleep if world is not None and not world.clock.realtime else None
+    acquisition = Acquisition(
+        source, requests, shots, dark=config.capture.dark, finite=config.replay is not None, jump=jump
+    )
+    meta = MapMeta.of(pipeline.map).model_dump()
+    publisher = MapPublisher(session, config.robot, meta, pipeline.map.snapshot)
+    service = Service(
+        acquisition=acquisition,
+        pipeline=pipeline,
+        publisher=publisher,
+        requests=requests,
+        shots=shots,
+        limits=config.limits,
+        robot=config.robot,
+        sink=sink,
+        encode=encode_update,
+        map_bytes=partial(to_npz_bytes, pool=config.pipeline.pool),
+        map_path=config.map,
+        program_done=None if world is None else lambda: world.program_done,
+        reload=None if load is None else Reload(config, load, acquisition, sensors),
+        exit_when_done=exit_when_done,
+    )
+    publisher.serve("capture", service.capture)
+    return service
+
+
+class Reload:
+    """Reads the configuration again and takes over what can change under way."""
+
+    def __init__(
+        self,
+        config: Config,
+        load: Callable[[], Config],
+        acquisition: Acquisition,
+        sensors: Sensors | None,
+    ) -> None:
+        self._config, self._load = config, load
+        self._acquisition, self._sensors = acquisition, sensors
+
+    def __call__(self) -> str:
+        """Returns a sentence on what was taken over and what needs a restart; empty for no change.
+
+        Raises:
+            ConfigurationError: If the file is not valid; then nothing was changed.
+        """
+        new = self._load()
+        changed = [name for name in Config.model_fields if getattr(new, name) != getattr(self._config, name)]
+        taken = [name for name in changed if name in RELOADABLE]
+        if "log_level" in taken:
+            logs.configure(new.log_level)
+        if self._sensors is not None and ("capture" in taken or "trigger" in taken):
+            make = partial(build_source, new, self._sensors)
+            self._acquisition.replace(make, new.capture.dark)
+        self._config = self._config.model_copy(update={name: getattr(new, name) for name in taken})
+        rest = [name for name in changed if name not in RELOADABLE]
+        told = [f"taken over: {', '.join(taken)}"] if taken else []
+        told += [f"needs a restart: {', '.join(rest)}"] if rest else []
+        return "; ".join(told)
+
+
+def run(load: Callable[[], Config], *, exit_when_done: bool = False) -> int:
+    """Runs the service until it is stopped and returns the exit code.
+
+    Args:
+        load: Reads the configuration; called again on a reload.
+        exit_when_done: Stop at the end of the replayed recording.
+
+    Raises:
+        InputError, ConfigurationError: If anything cannot be used as it stands.
+        DriverUnavailableError: If a vendor library is missing.
+    """
+    config = load()
+    logs.configure(config.log_level)
+    try:
+        with open_zenoh(config) as session:
+            return build_service(config, session, load=load, exit_when_done=exit_when_done).run()
+    except TransportError as error:
+        logs.log(_log, logging.CRITICAL, "no way to the consoles", error=error)
+        notify(f"STATUS={error}")
+        return os.EX_UNAVAILABLE
+
+
+def lights_off(config: Config) -> None:
+    """Turns the light off, whatever became of the service; for ExecStopPost=.
+
+    Raises:
+        DriverError: If the light cannot be reached.
+    """
+    if "light" in config.devices and not config.simulated:
+        device = config.devices["light"]
+        light: Light = backends.create(
+            "light", device.backend, name="light", clock=SystemClock(), options=device.options, shared={}
+        )
+        with light:  # off after open, and off in close
+            light.set_level(0.0)
+
+
+def classes_toml(classes: SurfaceClasses) -> str:
+    """Returns the classes as the text of a `classes.toml`."""
+    # TOML's basic strings have JSON's escapes.
+    names, colours = (json.dumps(list(values)) for values in (classes.names, classes.colours))
+    return f"names = {names}\ncolours = {colours}\n"
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("surfclass")
+    except importlib.metadata.PackageNotFoundError:
+        return "(not installed)"
