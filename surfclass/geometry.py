@@ -123,6 +123,25 @@ def check_size(depth_mm: NDArray[Any], camera: Camera) -> None:
         raise InputError(f"depth image: shape {depth_mm.shape}, the rig's depth camera has {camera.shape}")
 
 
+def fit_plane(points: NDArray[Any]) -> tuple[Float64, float]:
+    """Returns the plane `normal · p = offset` nearest to points (n, 3), by least squares across it.
+
+    The normal (3,) is unit and turned to the frame's origin, so that the offset (m) is not positive.
+
+    Raises:
+        InputError: If there are fewer than three points, or they lie on a line.
+    """
+    p = np.asarray(points, np.float64)
+    if p.ndim != 2 or p.shape[1] != 3 or len(p) < 3 or not np.isfinite(p).all():
+        raise InputError(f"plane: points of shape {p.shape}, needed are 3 or more finite ones (n, 3)")
+    centre = p.mean(axis=0)
+    _, width, axes = np.linalg.svd(p - centre, full_matrices=False)
+    if width[1] <= 1e-6 * max(width[0], 1e-12):
+        raise InputError(f"plane: the {len(p)} points lie on a line")
+    normal = axes[2] if axes[2] @ centre <= 0 else -axes[2]
+    return normal, float(normal @ centre)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RegisteredDepth:
     """The surface point that each colour pixel sees, and where the depth camera measured it.

@@ -19,7 +19,7 @@ from raycast import (
 )
 
 from surfclass.errors import ConfigurationError, InputError
-from surfclass.geometry import depth_to_points, project, rays, register
+from surfclass.geometry import depth_to_points, fit_plane, project, rays, register
 from surfclass.rig import parse_rig
 from surfclass.types import Transform
 
@@ -96,6 +96,26 @@ def test_size_of_the_depth_image_is_checked():
     for call in (lambda d: depth_to_points(d, rig.depth), lambda d: register(d, rig)):
         with pytest.raises(InputError, match=r"\(480, 640\)"):
             call(np.zeros((640, 480), np.uint16))
+
+
+def test_plane_through_noisy_points_faces_the_origin():
+    rng = np.random.default_rng(0)
+    normal = np.array([0.3, -0.2, -0.933])
+    normal /= np.linalg.norm(normal)
+    flat = rng.uniform(-0.2, 0.2, (500, 3)) + np.array([0, 0, 0.8])
+    on_plane = flat - np.outer(flat @ normal + 0.7, normal) + rng.normal(0, 1e-4, (500, 1)) * normal
+    found, offset = fit_plane(on_plane)
+    assert found == pytest.approx(normal, abs=2e-4)
+    assert offset == pytest.approx(-0.7, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [np.zeros((2, 3)), np.outer(np.arange(5.0), [1, 2, 3]), np.full((4, 3), np.nan), np.ones((4, 2))],
+)
+def test_plane_needs_three_points_off_a_line(points):
+    with pytest.raises(InputError, match="plane"):
+        fit_plane(points)
 
 
 @pytest.mark.parametrize("name", SIZES)
