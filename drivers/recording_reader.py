@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from mcap.data_stream import ReadDataStream
 from mcap.reader import SeekingReader
-from mcap.records import Channel
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from drivers.plate import Plate, parse_plate
@@ -40,6 +42,7 @@ from surfclass.frames import ROLES, Capture
 from surfclass.rig import DepthRig, Rig, SurfaceClasses, parse_classes, parse_depth_rig
 
 RECORD_LIMIT = 1 << 30
+_RECORD_HEAD = 1 + 8  # opcode and length
 _IMAGE_TOPICS = tuple(f"/{kind}" for kind in IMAGES)
 _ALLOWED = {
     **dict.fromkeys(_IMAGE_TOPICS, (RAW, COMPRESSED)),
@@ -167,10 +170,21 @@ class Recording:
             parts = {}
 
     def _entries(self, topics: Collection[str]) -> Iterator[Entry]:
+        # The library's reader would unpack the whole file before it gives the first message.
         with reading(self.path) as file:
-            for schema, channel, message in _reader(file).iter_messages(topics, log_time_order=False):
-                name = "" if schema is None else schema.name
-                yield Entry(channel.topic, name, message.log_time, message.sequence, message.data)
+            summary = _reader(file).get_summary()
+            assert summary is not None  # open() has seen it
+            wanted = {number for number, channel in summary.channels.items() if channel.topic in topics}
+            for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+                if wanted.isdisjoint(index.message_index_offsets):
+                    continue
+                file.seek(index.chunk_start_offset + _RECORD_HEAD)
+                chunk = Chunk.read(ReadDataStream(file))
+                for record in breakup_chunk(chunk, validate_crc=True):
+                    if isinstance(record, Message) and record.channel_id in wanted:
+                        channel = summary.channels[record.channel_id]
+                        schema = summary.schemas[channel.schema_id].name
+                        yield Entry(channel.topic, schema, record.log_time, record.sequence, record.data)
 
 
 @contextlib.contextmanager
