@@ -17,6 +17,7 @@ from surfclass.types import Bool, Float32, Float64
 _BAND_EDGES_M = (0.0, 0.7, 1.4, 2.8, np.inf)  # readings in one band of distances share one window size
 _BAND_CENTRES_M = (0.5, 1.0, 2.0, 4.0)
 _COARSE_FROM_PX = 40  # windows from this side on are summed from blocks of 4 × 4 pixels, others 2 × 2
+_WINDOW_SHARES = (1.0, 0.6)  # what finds no plane in the whole window may lie on a small surface
 _THIN = 0.25  # a plane thinner than this share of tau_kappa needs no better window
 _BETTER = 0.5  # an eccentric window must have less than this share of the centred one's variance
 _COUNTED = np.linspace(-1, 1, 7)  # where in a window the literal count of inliers looks, per axis
@@ -80,8 +81,9 @@ def estimate_normals(
     On a plane the inverse depth is linear in the ray (x/z, y/z), and a structured-light camera's noise
     is even in inverse depth, so the least-squares plane is one linear fit over sums in a window.
     Pixels share windows in blocks of 2 × 2 (far away 4 × 4). Near creases and jumps, where the centred
-    window fails or an eccentric one fits much better, the best of the eight eccentric windows that hold
-    the pixel serves; a pixel farther than 2 τ_κ from its plane has no normal.
+    window fails or an eccentric one fits much better, the best of the eccentric windows that hold
+    the pixel serves; a pixel farther than 2 τ_κ from its plane has no normal. What is left without is
+    tried again with a smaller window.
 
     Args:
         depth_mm: (h, w) along the optical axis, 0 = no return.
@@ -105,19 +107,48 @@ def estimate_normals(
         block_px = 4 if side_px >= _COARSE_FROM_PX else 2
         for finer in (1, 2)[: block_px // 2]:
             blocks.setdefault(2 * finer, _halved(blocks[finer]))
-        reach = max(1, round((side_px / block_px - 1) / 2))
-        planes = _fit(blocks[block_px], reach, settings)
-        planes = _best_window(planes, blocks[block_px], reach, settings)
-        accepted = planes.accepted | _majority_within(planes, points, reach, block_px, settings)
-
-        at_pixel = _per_pixel(planes.normal, block_px, camera.shape)
-        away = _per_pixel(planes.offset, block_px, camera.shape)
-        away -= np.einsum("ihw,ihw->hw", at_pixel, points)
-        band &= _per_pixel(accepted.view(np.uint8), block_px, camera.shape) > 0
-        band &= np.abs(away) <= 2 * _tau_kappa(points[2], settings)
-        np.negative(at_pixel, out=normal, where=band)
-        valid |= band
+        for share in _WINDOW_SHARES:
+            reach = max(1, round((share * side_px / block_px - 1) / 2))
+            part = _rectangle(band, block_px, 2 * reach + 1)
+            if part is None:
+                break
+            own = tuple(slice(s.start // block_px, -(-s.stop // block_px)) for s in part)
+            found, served = _normals_in(
+                points[:, *part], band[part], blocks[block_px][:, *own], reach, settings
+            )
+            np.copyto(normal[:, *part], found, where=served)
+            valid[part] |= served
+            band[part] &= ~served
     return Normals(normal, valid)
+
+
+def _rectangle(band: Bool, block_px: int, margin: int) -> tuple[slice, slice] | None:
+    """The whole blocks around the band's pixels and `margin` blocks more; None where there is no pixel."""
+    sides = []
+    for axis, length in ((1, band.shape[0]), (0, band.shape[1])):
+        index = np.flatnonzero(band.any(axis=axis))
+        if index.size == 0:
+            return None
+        first = max(0, int(index[0]) // block_px - margin) * block_px
+        sides.append(slice(first, min(length, (int(index[-1]) // block_px + 1 + margin) * block_px)))
+    return sides[0], sides[1]
+
+
+def _normals_in(
+    points: Float32, band: Bool, blocks: Float64, reach: int, settings: NormalSettings
+) -> tuple[Float32, Bool]:
+    """Returns normals (3, h, w) of one part of the image, and which pixels of `band` have one."""
+    shape = band.shape
+    block_px = -(-shape[0] // blocks.shape[1])
+    planes = _fit(blocks, reach, settings)
+    planes = _best_window(planes, blocks, reach, settings)
+    accepted = planes.accepted | _majority_within(planes, points, reach, block_px, settings)
+
+    normal = _per_pixel(planes.normal, block_px, shape)
+    away = _per_pixel(planes.offset, block_px, shape) - np.einsum("ihw,ihw->hw", normal, points)
+    served = band & (_per_pixel(accepted, block_px, shape))
+    served &= np.abs(away) <= 2 * _tau_kappa(points[2], settings)
+    return np.negative(normal), served
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,7 +270,7 @@ def _narrow_variance(
 
 
 def _best_window(planes: _Planes, blocks: Float64, reach: int, settings: NormalSettings) -> _Planes:
-    """Replaces a block's plane by the thinnest one of the eight windows that have it on their rim.
+    """Replaces a block's plane by the thinnest of the eccentric windows that hold it.
 
     Only where that is needed or much better, and only by a plane that the block itself lies on.
     """
@@ -255,8 +286,9 @@ def _best_window(planes: _Planes, blocks: Float64, reach: int, settings: NormalS
     row, column = np.mgrid[:rows, :columns].astype(np.int32)
     source = row * columns + column
     own = source.copy()
-    for down in (-reach, 0, reach):
-        for right in (-reach, 0, reach):
+    steps = sorted({-reach, -(reach // 2), 0, reach // 2, reach})
+    for down in steps:
+        for right in steps:
             if down == right == 0:
                 continue
             here = np.s_[max(0, -down) : rows - max(0, down), max(0, -right) : columns - max(0, right)]

@@ -102,6 +102,16 @@ def test_normals_reach_up_to_a_crease():
     assert (cosine[near & result.valid] > np.cos(np.radians(15))).mean() > 0.97
 
 
+def test_surfaces_smaller_than_the_whole_window_have_normals_too():
+    strip = Plane((0, 0, -1.0), -1.0, (-0.018, -1), (0.018, 1))  # 21 pixels wide, the window has 30
+    depth, surface = cast([strip, Plane((0, 0, -1.0), -1.5)], CAMERA)
+    result = estimate_normals(kinect(depth), CAMERA)
+    core = cv2.erode((surface == 0).astype(np.uint8), np.ones((1, 5))) > 0
+    assert result.valid[core].mean() > 0.95
+    truth = np.degrees(np.arccos(np.clip(-result.normal[2][core & result.valid], -1, 1)))
+    assert np.median(truth) < 3.5
+
+
 def test_too_few_neighbours():
     patch = np.zeros((480, 640), np.uint16)
     patch[200, 300:303] = 1000
