@@ -9,7 +9,7 @@ import numpy as np
 
 from surfclass.errors import InputError
 from surfclass.frames import Capture
-from surfclass.rig import Rig
+from surfclass.rig import DepthRig
 from surfclass.types import Float64, Transform, freeze
 
 # Standard D-H rows of the VM-6083 (Table 6.1): alpha, a, d, theta at zero. The last d is the flange offset.
@@ -86,7 +86,7 @@ def pose_difference(first: Transform, second: Transform) -> tuple[float, float]:
     return distance, 2 * float(np.arcsin(min(1.0, chord / np.sqrt(8))))
 
 
-def depth_pose(capture: Capture, rig: Rig) -> Transform:
+def depth_pose(capture: Capture, rig: DepthRig) -> Transform:
     """Returns the depth camera's pose in `base` for one capture (Eq. 3.2, A.9).
 
     The recorded pose is taken where there is one, else it follows from the joint angles and the

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from surfclass.errors import InputError
 from surfclass.pooling import Pool
-from surfclass.types import Float32
+from surfclass.types import Float32, Int32
 from surfclass.voxel_map import MapLayers, VoxelMap
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # the earliest a zip can hold; a file's date must not change its bytes
@@ -47,6 +47,27 @@ class MapFile:
     voxel_size_m: float
     classes: tuple[str, ...]
     layers: MapLayers
+
+    def at(self, index: Int32) -> MapLayers:
+        """Returns the layers of the voxels asked for, (n, 3), in that order; uniform where there is none."""
+        rows = {voxel: row for row, voxel in enumerate(map(tuple, self.layers.index.tolist()))}
+        found = np.array([rows.get(voxel, -1) for voxel in map(tuple, index.tolist())], np.intp)
+        seen = found >= 0
+
+        def of(values: NDArray[Any], absent: float) -> NDArray[Any]:
+            picked = np.full((len(index), *values.shape[1:]), absent, values.dtype)
+            picked[seen] = values[found[seen]]
+            return picked
+
+        nothing, layers = 1 / len(self.classes), self.layers
+        return MapLayers(
+            index=index,
+            p_colour=of(layers.p_colour, nothing),
+            p_texture=of(layers.p_texture, nothing),
+            p=of(layers.p, nothing),
+            weight=of(layers.weight, 0),
+            count=of(layers.count, 0),
+        )
 
 
 def to_npz_bytes(voxels: VoxelMap, pool: Pool = "log-linear") -> bytes:

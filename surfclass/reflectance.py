@@ -114,6 +114,18 @@ def diffuse_reflectance(
     raise InputError(f"K_d: mode {mode!r}, allowed are 'thesis' and 'full'")
 
 
+def lacking_for_full_model(rig: Rig) -> list[str]:
+    """Returns the rig's keys that the full model needs and that are missing."""
+    response, light = rig.response, rig.light
+    needed = {
+        "response.inverse": None if response is None else response.inverse,
+        "rgb.vignetting": rig.rgb.vignetting,
+        "light.axis_rgb": None if light is None else light.axis_rgb,
+        "light.falloff_exponent": None if light is None else light.falloff_exponent,
+    }
+    return [key for key, value in needed.items() if value is None]
+
+
 def _missing(rig: Rig, what: str, how: str) -> MissingCalibrationError:
     return MissingCalibrationError(f"rig {rig.name}: {what} is missing, K_d needs it; run {how}")
 

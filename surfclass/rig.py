@@ -179,6 +179,20 @@ class DepthRig(Table):
             raise ValueError(f"unknown schema, allowed is {SCHEMA}")
         return version
 
+    @cached_property
+    def flange_T_depth(self) -> Transform:
+        """The hand-eye transform.
+
+        Raises:
+            MissingCalibrationError: If the rig has none.
+        """
+        if self.transforms.flange_T_depth is None:
+            raise MissingCalibrationError(
+                f"rig {self.name}: transforms.flange_T_depth is missing, and the captures give only "
+                "joint angles; run the hand-eye calibration, or give the captures their poses"
+            )
+        return Transform("flange", "depth", np.array(self.transforms.flange_T_depth))
+
     def check(self, capture: Capture) -> None:
         """Raises InputError where an image of the capture has not the size that the rig states."""
         colour, dark = capture.colour, capture.dark
@@ -229,20 +243,6 @@ class Rig(DepthRig):
     def rgb_T_depth(self) -> Transform:
         """The depth camera in the colour camera's frame."""
         return Transform("rgb", "depth", np.array(self.transforms.rgb_T_depth))
-
-    @cached_property
-    def flange_T_depth(self) -> Transform:
-        """The hand-eye transform.
-
-        Raises:
-            MissingCalibrationError: If the rig has none.
-        """
-        if self.transforms.flange_T_depth is None:
-            raise MissingCalibrationError(
-                f"rig {self.name}: transforms.flange_T_depth is missing, and the captures give only "
-                "joint angles; run the hand-eye calibration, or give the captures their poses"
-            )
-        return Transform("flange", "depth", np.array(self.transforms.flange_T_depth))
 
     def whole(self) -> Rig:
         """Returns itself."""

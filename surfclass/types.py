@@ -175,6 +175,17 @@ class Observation:
     has_texture: Bool
     weight: Float32
 
+    def of(self, chosen: Bool) -> Observation:
+        """Returns the points where `chosen` (n,) is True."""
+        return Observation(
+            self.point_base[chosen],
+            self.colour[chosen],
+            self.texture[chosen],
+            self.has_colour[chosen],
+            self.has_texture[chosen],
+            self.weight[chosen],
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:

@@ -1,0 +1,355 @@
+"""The command line; each command imports what it needs when it runs, so that --help answers at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from surfclass.pipeline import PipelineSettings
+
+EXIT_GATE_FAILED, EXIT_USAGE, EXIT_DEVICE, EXIT_CONFIGURATION = 1, 2, 69, 78
+
+app = typer.Typer(
+    name="surfclass",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode="rich",
+    help="""
+    What a blasting robot on a steel bridge is looking at: RGB-D captures become a classified 3D map.
+
+    [bold]A first walk[/bold], without hardware:
+
+    [cyan]surfclass import FOLDER rec.mcap[/cyan]
+
+    [cyan]surfclass train rec.mcap --out model.npz[/cyan]
+
+    [cyan]surfclass evaluate rec.mcap --model model.npz[/cyan]
+
+    [cyan]surfclass replay rec.mcap --model model.npz --map map.npz[/cyan]
+
+    [cyan]surfclass show map map.npz --png map.png[/cyan]
+
+    On the robot: `surfclass check`, then `surfclass run`; at the console: `surfclass watch`.
+
+    Exit codes: 0 pass, 1 a quality gate failed, 2 usage, 69 device unavailable, 78 configuration.
+    """,
+)
+show = typer.Typer(no_args_is_help=True, help="Draw results: a map as picture or PLY, a capture's images.")
+app.add_typer(show, name="show")
+
+RecordingArgument = Annotated[Path, typer.Argument(metavar="REC.mcap", help="A recording.")]
+ModelOption = Annotated[Path, typer.Option("--model", metavar="MODEL", help="What `train` wrote.")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The TOML file.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="TABLE.KEY=VALUE", help="One-off override; may be repeated."),
+]
+JsonOption = Annotated[
+    str | None, typer.Option("--json", metavar="FILE", help='Write the result as JSON; "-" is stdout.')
+]
+ThesisOption = Annotated[
+    bool,
+    typer.Option("--thesis", help="As in the thesis: every pixel an independent observation, linear pool."),
+]
+
+
+class Update(StrEnum):
+    """How a frame's pixels count."""
+
+    frame = "frame"
+    independent = "independent"
+
+
+class Pool(StrEnum):
+    """How the two layers are fused."""
+
+    log_linear = "log-linear"
+    linear = "linear"
+
+
+class Route(StrEnum):
+    """What is evaluated."""
+
+    rgb = "rgb"
+    ab = "ab"
+    kd = "kd"
+    texture = "texture"
+    combined = "combined"
+    all = "all"
+
+
+UpdateOption = Annotated[
+    Update | None, typer.Option(help="frame: one observation a voxel and frame; independent: Eq. 3.9.")
+]
+PoolOption = Annotated[Pool | None, typer.Option(help="log-linear, or linear: Eq. 3.11.")]
+
+
+@app.command("import")
+def import_(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="rig.toml, classes.toml, captures.csv, …")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.mcap")],
+) -> None:
+    """Turn a data folder into a recording; images keep their original bytes."""
+    from daemon import offline
+
+    count = offline.import_folder(folder, out)
+    offline.console.print(f"{out}: {count} captures")
+
+
+@app.command()
+def recover(
+    path: Annotated[Path, typer.Argument(metavar="REC.mcap[.active]", help="An unfinished recording.")],
+) -> None:
+    """Make a whole recording out of one that was cut off."""
+    from daemon import offline
+    from drivers.recording import recover as recover_recording
+
+    offline.console.print(f"{recover_recording(path)}")
+
+
+class ClassifierKind(StrEnum):
+    """Kinds of classifiers."""
+
+    svm = "svm"
+    naive_bayes = "naive-bayes"
+
+
+@app.command()
+def train(
+    recording: RecordingArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="MODEL", help="Where the model goes.")],
+    thesis: Annotated[
+        bool, typer.Option("--thesis", help="K_d by the printed polynomial even if the full model is there.")
+    ] = False,
+    classifier: Annotated[ClassifierKind, typer.Option(help="Of both routes.")] = ClassifierKind.svm,
+    seed: Annotated[int, typer.Option(min=0, help="Of drawing samples and folds.")] = 0,
+) -> None:
+    """Train both routes from a recording's labelled `train` captures."""
+    from daemon import offline
+    from surfclass.training import TrainingSettings
+
+    settings = TrainingSettings(
+        classifier="svm" if classifier is ClassifierKind.svm else "naive_bayes",
+        reflectance="thesis" if thesis else None,
+        seed=seed,
+    )
+    model = offline.train_model(recording, out, settings)
+    offline.console.print(f"{out}: {', '.join(model.colour)}, {model.texture.feature}")
+
+
+@app.command()
+def replay(
+    recording: RecordingArgument,
+    model: ModelOption,
+    map_: Annotated[Path, typer.Option("--map", metavar="OUT.npz", help="Where the map goes.")],
+    thesis: ThesisOption = False,
+    update: UpdateOption = None,
+    pool: PoolOption = None,
+) -> None:
+    """Run a recording's `map` and `test` captures through the pipeline; the same bytes every time."""
+    from daemon import offline
+
+    pipeline, stage_ms = offline.replay(recording, model, map_, _settings(thesis, update, pool))
+    offline.print_stages(stage_ms)
+    offline.console.print(f"{map_}: {len(pipeline.map):,} voxels of {pipeline.map.size_m * 1000:g} mm")
+
+
+@app.command()
+def evaluate(
+    recording: RecordingArgument,
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="MODEL", help="What `train` wrote.")
+    ] = None,
+    route: Annotated[Route, typer.Option(help="Which route's accuracy.")] = Route.all,
+    json_: JsonOption = None,
+    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the confusion matrices.")] = None,
+    map_: Annotated[
+        Path | None, typer.Option("--map", metavar="MAP.npz", help="Score this map instead of a new one.")
+    ] = None,
+    require: Annotated[
+        float | None,
+        typer.Option(
+            min=0, max=1, metavar="SHARE", help="Exit 1 if fewer of the fused map's voxels are right."
+        ),
+    ] = None,
+    thesis: ThesisOption = False,
+    update: UpdateOption = None,
+    pool: PoolOption = None,
+) -> None:
+    """Accuracy against the labels of the `test` captures: voxels, pixels, calibration."""
+    from daemon import offline
+
+    settings = _settings(thesis, update, pool)
+    if (model is None) == (map_ is None):
+        raise typer.BadParameter(
+            "give --model MODEL to make the map anew, or --map MAP.npz to score a finished one"
+        )
+    if model is not None:
+        result = offline.evaluate_recording(recording, model, route.value, settings)
+        offline.print_evaluation(result)
+    elif map_ is not None:
+        result = offline.evaluate_map(recording, map_)
+        offline.print_fused(result)
+    if json_ is not None:
+        offline.write_json(json_, result)
+    if png is not None:
+        from daemon.pictures import draw_confusions
+
+        draw_confusions(png, result)
+    if require is not None:
+        routes = result["routes"]
+        gate = "combined" if "combined" in routes else next(iter(routes))
+        reached = routes[gate]["fused"]["overall"]
+        verdict = "PASS" if reached >= require else "FAIL"
+        offline.console.print(f"{verdict}: {gate} {reached:.1%} of the voxels right, {require:.1%} required")
+        raise typer.Exit(0 if reached >= require else EXIT_GATE_FAILED)
+
+
+@show.command("map")
+def show_map(
+    map_: Annotated[Path, typer.Argument(metavar="MAP.npz")],
+    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw it.")] = None,
+    ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it as coloured points.")] = None,
+    classes: Annotated[
+        Path | None, typer.Option(metavar="CLASSES.toml", help="Take the colours from here.")
+    ] = None,
+) -> None:
+    """Draw a map as a picture, or write it as PLY."""
+    from daemon import maps
+
+    maps.show(map_, png, ply, classes)
+
+
+@show.command("capture")
+def show_capture(
+    recording: RecordingArgument,
+    png: Annotated[Path, typer.Option(metavar="FILE", help="Where the picture goes.")],
+    name: Annotated[list[str] | None, typer.Option(help="Which captures; default: the first four.")] = None,
+    model: Annotated[Path | None, typer.Option(metavar="MODEL", help="Classify them too.")] = None,
+) -> None:
+    """Draw captures: colour, depth, truth and, with a model, what each route makes of them."""
+    from daemon import maps
+
+    maps.show_captures(recording, png, name or [], model)
+
+
+@app.command()
+def capture(
+    out: Annotated[Path, typer.Argument(metavar="OUT.mcap")],
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    count: Annotated[int, typer.Option(min=1, help="How many captures.")] = 1,
+    role: Annotated[str, typer.Option(help="What they are for: map, train, test, light, …")] = "map",
+    dark: Annotated[bool, typer.Option("--dark", help="Take an unlit frame with each.")] = False,
+) -> None:
+    """Take captures with the configured devices and write a recording."""
+    from daemon import live
+
+    live.capture(out, config, set_ or [], count, role, dark)
+
+
+@app.command()
+def run(
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    from_: Annotated[
+        Path | None, typer.Option("--from", metavar="REC.mcap", help="Take the captures from a recording.")
+    ] = None,
+    exit_when_done: Annotated[
+        bool, typer.Option("--exit-when-done", help="Stop after the recording's last capture.")
+    ] = False,
+) -> None:
+    """Run the service in the foreground: capture, classify, map, publish, record."""
+    from daemon import live
+
+    raise typer.Exit(live.run(config, set_ or [], from_, exit_when_done))
+
+
+@app.command()
+def watch(
+    connect: Annotated[
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="Where the service listens.")
+    ] = None,
+    robot: Annotated[str, typer.Option(help="The robot's name in the keys.")] = "robot",
+    map_: Annotated[
+        Path | None, typer.Option("--map", metavar="OUT.npz", help="Write the map when it ends.")
+    ] = None,
+    until_gone: Annotated[
+        bool, typer.Option("--until-gone", help="End when the service that was seen goes away.")
+    ] = False,
+    captures: Annotated[
+        int | None, typer.Option(min=1, help="End when the map holds this many captures.")
+    ] = None,
+    timeout_s: Annotated[float | None, typer.Option(min=0, help="Give up after so long.")] = None,
+    json_: JsonOption = None,
+) -> None:
+    """Keep the same map as the service, over Zenoh, and show how it grows."""
+    from daemon import live
+
+    raise typer.Exit(
+        live.watch(connect or ["tcp/127.0.0.1:7447"], robot, map_, until_gone, captures, timeout_s, json_)
+    )
+
+
+@app.command()
+def check(config: ConfigOption = None, set_: SetOption = None, json_: JsonOption = None) -> None:
+    """Open everything once and say what works, what does not, and what to do about it."""
+    from daemon import live
+
+    raise typer.Exit(live.check(config, set_ or [], json_))
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")] = Path("out/demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulated cell.")] = 0,
+    viewpoints: Annotated[int, typer.Option(min=1, max=10, help="How many places to visit.")] = 10,
+) -> None:
+    """Everything once, on the simulated cell: commission, train, map with a service, watch it, score it."""
+    from daemon.demo import run_demo
+
+    raise typer.Exit(run_demo(out, seed, viewpoints))
+
+
+def _settings(thesis: bool, update: Update | None, pool: Pool | None) -> PipelineSettings:
+    from surfclass.pipeline import THESIS, PipelineSettings
+
+    base = THESIS if thesis else PipelineSettings()
+    return PipelineSettings(
+        update.value if update is not None else base.update, pool.value if pool is not None else base.pool
+    )
+
+
+def main() -> None:
+    """Runs the command line; errors that people can mend are one message, without a traceback."""
+    from drivers.errors import DriverError, DriverUnavailableError
+    from surfclass.errors import ConfigurationError, InputError
+
+    try:
+        app()
+    except ConfigurationError as error:
+        sys.exit(_say(error, EXIT_CONFIGURATION))
+    except InputError as error:
+        sys.exit(_say(error, EXIT_USAGE))
+    except DriverUnavailableError as error:
+        sys.exit(_say(error, EXIT_CONFIGURATION))
+    except DriverError as error:
+        sys.exit(_say(error, EXIT_DEVICE))
+    except BrokenPipeError:
+        # The reader of our standard output has gone; nothing is left to say, to nobody.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(EXIT_GATE_FAILED)
+    except OSError as error:  # a full disk, a missing permission: the message names the file
+        sys.exit(_say(error, EXIT_DEVICE))
+
+
+def _say(error: Exception, code: int) -> int:
+    sys.stderr.write(f"surfclass: {error}\n")
+    return code

@@ -1,0 +1,242 @@
+"""The demo: everything once on the simulated cell, service and console as processes of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import maps, offline, pictures
+from daemon.files import write_atomically
+from daemon.offline import console
+from drivers.recording import Recording, RecordingWriter
+from drivers.sensor_package import SensorPackage
+from drivers.sim import truth
+from drivers.sim.devices import SimArm, SimColourCamera, SimDepthCamera, SimLight
+from drivers.sim.world import SimWorld
+from surfclass.errors import InputError
+from surfclass.frames import Capture
+from surfclass.pipeline import PipelineSettings
+from surfclass.rig import parse_classes
+from surfclass.training import TrainingSettings
+
+_WAIT_S = 240.0
+_STOP_S = 30.0
+
+
+def run_demo(out: Path, seed: int, viewpoints: int) -> int:
+    """Runs the demo into `out` and returns the exit code: 0 if the console's map equals the service's.
+
+    Raises:
+        InputError: If a step finds its input unusable; the message says which.
+    """
+    start = time.monotonic()
+    out.mkdir(parents=True, exist_ok=True)
+    _clear(out)
+
+    console.rule("1  commission from the simulation's truth")
+    world = SimWorld("cell", seed)
+    rig_text, classes_text = truth.rig(world), truth.classes_toml()
+    write_atomically(out / "rig.toml", rig_text.encode())
+    write_atomically(out / "classes.toml", classes_text.encode())
+    console.print(f"rig.toml, classes.toml: {len(parse_classes(classes_text, 'classes').names)} surfaces")
+
+    console.rule("2  train from one board of each surface, at 0.65 m and 0°")
+    _capture_boards(out / "train.mcap", rig_text, classes_text, seed)
+    offline.train_model(out / "train.mcap", out / "model.npz", TrainingSettings())
+
+    console.rule(f"3  map the cell from {viewpoints} viewpoints: service and console in two processes")
+    recorded, stage_ms = _map_cell(out, seed, viewpoints)
+
+    console.rule("4  score the map against the simulation's truth")
+    _label(recorded, out / "test.mcap", world)
+    result = offline.evaluate_recording(out / "test.mcap", out / "model.npz", "all", PipelineSettings())
+    offline.write_json(str(out / "evaluation.json"), result)
+    offline.print_evaluation(result)
+    _print_stages(stage_ms)
+
+    console.rule("5  pictures")
+    _draw(out, result)
+    equal = (out / "console.npz").read_bytes() == (out / "daemon.npz").read_bytes()
+    took = time.monotonic() - start
+    fused = result["routes"]["combined"]["fused"]
+    verdict = "equals" if equal else "DIFFERS FROM"
+    console.print(
+        f"\nThe console's map {verdict} the daemon's: {fused['voxels']:,} labelled voxels, "
+        f"{fused['overall']:.1%} right, {viewpoints} viewpoints, {took:.0f} s; results in {out}/",
+        style="bold green" if equal else "bold red",
+        highlight=False,
+    )
+    return 0 if equal else 1
+
+
+def _clear(out: Path) -> None:
+    """Removes what an earlier demo left; nothing that a demo does not write."""
+    shutil.rmtree(out / "recordings", ignore_errors=True)
+    for pattern in ("*.mcap", "*.mcap.active", "*.npz", "*.png", "*.ply", "*.json", "*.toml", "*.log"):
+        for path in out.glob(pattern):
+            path.unlink()
+
+
+def _capture_boards(path: Path, rig_text: str, classes_text: str, seed: int) -> None:
+    """Captures one board of each surface, labelled by what was put there."""
+    names = parse_classes(classes_text, "classes").names
+    with (
+        RecordingWriter(path, rig_text, classes_text, {"source": "simulated boards"}) as writer,
+        offline.progress(len(names), "capturing") as advance,
+    ):
+        for number, name in enumerate(names):
+            world = SimWorld(f"board:{name}", seed + 1 + number)
+            devices = SimColourCamera(world), SimDepthCamera(world), SimLight(world), SimArm(world)
+            with SensorPackage(world.clock, *devices) as package:
+                capture = package.capture(f"train_{name}", "train")
+            writer.write(dataclasses.replace(capture, label=_truth_label(world, capture)))
+            advance(name)
+
+
+def _truth_label(world: SimWorld, capture: Capture) -> NDArray[np.uint8]:
+    if capture.joints is None:
+        raise InputError(f"capture {capture.name}: has no joint angles")
+    return truth.label_image(world, capture.joints.q)
+
+
+def _map_cell(out: Path, seed: int, viewpoints: int) -> tuple[Path, dict[str, float]]:
+    """Runs service and console until the console's map holds every viewpoint.
+
+    Returns:
+        The service's recording, and the median milliseconds of its stages.
+    """
+    with tempfile.TemporaryDirectory(prefix="surfclass-") as sockets:
+        endpoint = f"unixsock-stream/{sockets}/z"
+        config = out / "service.toml"
+        write_atomically(config, _CONFIG.format(seed=seed, viewpoints=viewpoints, endpoint=endpoint).encode())
+        watch = ["watch", "--connect", endpoint, "--robot", "demo", "--captures", str(viewpoints)]
+        watch += ["--timeout-s", str(_WAIT_S), "--map", str(out / "console.npz")]
+        watch += ["--json", str(out / "console.json")]
+        with (
+            _process(out / "daemon.log", ["run", "--config", str(config)]) as service,
+            _process(out / "console.log", watch) as watcher,
+            console.status("the arm visits the cell"),
+        ):
+            _wait(watcher, service, out)
+            service.send_signal(signal.SIGTERM)
+            service.wait(_STOP_S)
+    (recording,) = (out / "recordings").glob("*.mcap")
+    return recording, json.loads((out / "console.json").read_text())["status"]["stage_ms"]
+
+
+def _wait(watcher: subprocess.Popen[bytes], service: subprocess.Popen[bytes], out: Path) -> None:
+    """Returns when the console has its map.
+
+    Raises:
+        InputError: If either process ends badly; the message ends with what it said last.
+    """
+    while watcher.poll() is None:
+        if service.poll() is not None:
+            raise InputError(
+                f"the service ended with {service.returncode}: {_last_words(out / 'daemon.log')}"
+            )
+        time.sleep(0.2)
+    if watcher.returncode != 0:
+        raise InputError(f"the console ended with {watcher.returncode}: {_last_words(out / 'console.log')}")
+
+
+def _last_words(log: Path) -> str:
+    return " / ".join(log.read_text(errors="replace").splitlines()[-3:])
+
+
+@contextmanager
+def _process(log: Path, arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    """Runs a command of this program; it is gone at the end, whatever happens."""
+    with log.open("wb") as stream:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "daemon.cli", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=stream,
+            stderr=stream,
+            env=os.environ | {"NO_COLOR": "1"},
+        )
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.wait(_STOP_S)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+
+def _label(recorded: Path, out: Path, world: SimWorld) -> None:
+    """Copies the service's captures, with the simulation's truth as their labels."""
+    recording = Recording.open(recorded)
+    assert recording.classes_text is not None
+    with RecordingWriter(
+        out, recording.rig_text, recording.classes_text, {"source": "simulated cell"}
+    ) as writer:
+        for capture in recording.captures():
+            writer.write(dataclasses.replace(capture, role="test", label=_truth_label(world, capture)))
+
+
+def _print_stages(stage_ms: dict[str, float]) -> None:
+    console.print(
+        "service, median milliseconds a capture: "
+        + ", ".join(f"{stage} {ms:.0f}" for stage, ms in stage_ms.items()),
+        highlight=False,
+    )
+
+
+def _draw(out: Path, result: dict[str, Any]) -> None:
+    pictures.draw_confusions(out / "confusion.png", result)
+    maps.show(out / "console.npz", out / "map.png", out / "map.ply", out / "classes.toml")
+    names = list(result["routes"]["combined"]["views"])
+    chosen = [names[i] for i in sorted({0, len(names) // 3, 2 * len(names) // 3, len(names) - 1})]
+    maps.show_captures(out / "test.mcap", out / "views.png", chosen, out / "model.npz")
+
+
+_CONFIG = """\
+schema = 1
+robot = "demo"
+rig = "rig.toml"
+model = "model.npz"
+map = "daemon.npz"
+
+[trigger.rest]
+
+[recording]
+directory = "recordings"
+
+[zenoh]
+listen = ["{endpoint}"]
+
+[colour]
+backend = "sim"
+
+[depth]
+backend = "sim"
+
+[light]
+backend = "sim"
+
+[arm]
+backend = "sim"
+
+[sim]
+scene = "cell"
+seed = {seed}
+viewpoints = {viewpoints}
+"""

@@ -1,0 +1,270 @@
+"""The commands that work on files: import, train, replay, evaluate, and what they print."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from daemon.files import read_file, write_atomically
+from drivers.folder import read_folder
+from drivers.recording import Recording, RecordingWriter
+from surfclass.errors import ConfigurationError, InputError
+from surfclass.evaluation import ROUTES, SCHEMA, benchmark_of, evaluate, score_layers
+from surfclass.kinematics import depth_pose
+from surfclass.map_file import MapFile, from_npz_bytes, to_npz_bytes
+from surfclass.model import Model
+from surfclass.pipeline import Pipeline, PipelineSettings
+from surfclass.training import TrainingSettings, train
+
+# What goes into a map: views of the place itself. Training boards and calibration targets may stand
+# anywhere, at other times.
+MAP_ROLES = ("map", "test")
+
+console = Console(stderr=True)
+
+
+@contextmanager
+def progress(total: int, what: str) -> Iterator[Any]:
+    """Shows a bar on standard error; yields `advance(description)`."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(what, total=total)
+
+        def advance(description: str) -> None:
+            bar.update(task, advance=1, description=f"{what} {description}")
+
+        yield advance
+
+
+def write_json(path: str, result: Any) -> None:
+    """Writes a result as JSON to a file, or to standard output for "-"."""
+    text = json.dumps(result, indent=1, allow_nan=False)
+    if path == "-":
+        sys.stdout.write(text + "\n")
+    else:
+        write_atomically(Path(path), (text + "\n").encode())
+
+
+def import_folder(directory: Path, out: Path) -> int:
+    """Turns a data folder into a recording and returns the number of captures.
+
+    Raises:
+        InputError: Naming the file and what is wrong with it; nothing is written then.
+    """
+    folder = read_folder(directory)
+    writer = RecordingWriter(
+        out, folder.rig_text, folder.classes_text, {"source": directory.name}, plate_text=folder.plate_text
+    )
+    try:
+        with progress(len(folder), "importing") as advance:
+            for capture, encoded in folder.captures():
+                both = capture.joints is not None and capture.base_T_depth is not None
+                if both and folder.depth_rig.transforms.flange_T_depth is not None:
+                    depth_pose(capture, folder.depth_rig)  # raises where pose and joints disagree
+                writer.write(capture, encoded)
+                advance(capture.name)
+    except BaseException:
+        writer.discard()
+        raise
+    writer.close()
+    return len(folder)
+
+
+def load_model(path: Path) -> Model:
+    """Returns the model in a file.
+
+    Raises:
+        InputError, ConfigurationError: If it cannot be read, or is not one.
+    """
+    return Model.from_bytes(read_file(path, "model"), str(path))
+
+
+def train_model(recording_path: Path, out: Path, settings: TrainingSettings) -> Model:
+    """Trains from a recording's `train` captures and writes the model."""
+    recording = Recording.open(recording_path)
+    if recording.classes is None:
+        raise InputError(f"{recording_path}: has no classes.toml, so its labels mean nothing")
+    with console.status("training") as status:
+
+        def note(sentence: str) -> None:
+            status.update(sentence)
+            console.print(f"  {sentence}", highlight=False)
+
+        model = train(
+            recording.captures("train"),
+            recording.captures("response"),
+            recording.rig,
+            recording.classes,
+            settings,
+            note,
+        )
+    write_atomically(out, model.to_bytes())
+    return model
+
+
+def replay(
+    recording_path: Path, model_path: Path, out: Path, settings: PipelineSettings
+) -> tuple[Pipeline, dict[str, list[float]]]:
+    """Runs a recording's captures through the pipeline and writes the map.
+
+    Returns:
+        The pipeline, and for each stage its milliseconds, capture by capture.
+    """
+    recording = Recording.open(recording_path)
+    model = load_model(model_path)
+    model.check(recording.rig, recording.classes)
+    pipeline = Pipeline(recording.rig, model, settings)
+    stage_ms: dict[str, list[float]] = {}
+    done = 0
+    with progress(len(recording), "replaying") as advance:
+        for capture in recording.captures():
+            if capture.role in MAP_ROLES:
+                for stage, ms in pipeline.process(capture).stage_ms.items():
+                    stage_ms.setdefault(stage, []).append(ms)
+                done += 1
+            advance(capture.name)
+    if not done:
+        raise InputError(f"{recording_path}: no capture of role {' or '.join(MAP_ROLES)} to make a map of")
+    write_atomically(out, to_npz_bytes(pipeline.map, settings.pool))
+    return pipeline, stage_ms
+
+
+def evaluate_recording(
+    recording_path: Path, model_path: Path, route: str, settings: PipelineSettings
+) -> dict[str, Any]:
+    """Returns the figures of one route, or of all that the model has.
+
+    Raises:
+        ConfigurationError: If the model does not fit the recording, or has not the route.
+    """
+    recording = Recording.open(recording_path)
+    model = load_model(model_path)
+    model.check(recording.rig, recording.classes)
+    routes = list(ROUTES) if route == "all" else [route]
+    lacking = [name for name in routes if (f := ROUTES[name]) is not None and f not in model.colour]
+    if lacking and route != "all":
+        raise ConfigurationError(
+            f"{model_path}: has no {ROUTES[route]} route; it was trained on {', '.join(model.colour)}"
+        )
+    if lacking:
+        console.print(f"left out, since the model has not been trained on them: {', '.join(lacking)}")
+    routes = [name for name in routes if name not in lacking]
+    pipeline = Pipeline(recording.rig, model, settings)
+    with progress(len(recording), "evaluating") as advance:
+        return evaluate(recording.captures("test"), pipeline, routes, advance)
+
+
+def evaluate_map(recording_path: Path, map_path: Path) -> dict[str, Any]:
+    """Returns the figures of a finished map on the benchmark of a recording's labels.
+
+    Raises:
+        InputError: If the map's voxel size or classes are not the recording's.
+    """
+    recording = Recording.open(recording_path)
+    classes = recording.classes
+    if classes is None:
+        raise InputError(f"{recording_path}: has no classes.toml, so its labels mean nothing")
+    found = load_map(map_path)
+    if found.classes != classes.names or found.voxel_size_m != recording.rig.voxel_size_m:
+        raise InputError(
+            f"{map_path}: voxels of {found.voxel_size_m:g} m and classes {', '.join(found.classes)}; the "
+            f"recording has {recording.rig.voxel_size_m:g} m and {', '.join(classes.names)}"
+        )
+    with progress(len(recording), "evaluating") as advance:
+        benchmark = benchmark_of(recording.captures("test"), recording.rig, len(classes.names), advance)
+    index, truth = benchmark.truth()
+    layers = found.at(index)
+    routes = ("colour", "texture", "combined")
+    return {
+        "schema": SCHEMA,
+        "classes": list(classes.names),
+        "routes": {route: {"fused": score_layers(layers, route, truth).to_json()} for route in routes},
+    }
+
+
+def load_map(path: Path) -> MapFile:
+    """Returns the map in a file.
+
+    Raises:
+        InputError: If it cannot be read, or is not one.
+    """
+    return from_npz_bytes(read_file(path, "map"), str(path))
+
+
+def print_fused(result: dict[str, Any]) -> None:
+    """Prints the figures of the fused map, and each class's."""
+    routes = result["routes"]
+    table = Table(title="all test captures fused: share of voxels", title_justify="left")
+    for heading in ("route", "right", "balanced", "rejected", "ECE", "NLL", "voxels"):
+        table.add_column(heading, justify="left" if heading == "route" else "right")
+    for route, figures in routes.items():
+        fused = figures["fused"]
+        table.add_row(
+            route,
+            *(share(fused[name]) for name in ("overall", "balanced", "rejected")),
+            *("–" if fused[name] is None else f"{fused[name]:.3f}" for name in ("ece", "nll")),
+            f"{fused['voxels']:,}",
+        )
+    console.print(table)
+    print_per_class(result)
+
+
+def print_per_class(result: dict[str, Any]) -> None:
+    """Prints which share of each class's classified voxels is right, by every route."""
+    table = Table(title="right, of each class's classified voxels", title_justify="left")
+    table.add_column("surface")
+    for route in result["routes"]:
+        table.add_column(route, justify="right")
+    for k, name in enumerate(result["classes"]):
+        shares = [recalls(figures["fused"])[k] for figures in result["routes"].values()]
+        table.add_row(name, *map(share, shares))
+    console.print(table)
+
+
+def print_evaluation(result: dict[str, Any]) -> None:
+    """Prints the fused figures, and the pixel accuracy of every view."""
+    print_fused(result)
+    routes = result["routes"]
+    views = Table(title="each test capture: share of pixels right", title_justify="left")
+    views.add_column("capture")
+    for route in routes:
+        views.add_column(route, justify="right")
+    for name in next(iter(routes.values()))["pixels"]:
+        views.add_row(name, *(share(figures["pixels"][name]["overall"]) for figures in routes.values()))
+    console.print(views)
+
+
+def recalls(fused: dict[str, Any]) -> list[float | None]:
+    """Returns for each class the share of its classified voxels that is right; None without any."""
+    rows = fused["confusion"]
+    return [row[k] / sum(row) if sum(row) else None for k, row in enumerate(rows)]
+
+
+def share(value: float | None) -> str:
+    """A share as percent, or a dash."""
+    return "–" if value is None else f"{100 * value:.1f} %"
+
+
+def print_stages(stage_ms: dict[str, list[float]]) -> None:
+    """Prints the milliseconds that each stage of the pipeline took."""
+    table = Table(title="milliseconds a capture", title_justify="left")
+    for heading in ("stage", "median", "longest"):
+        table.add_column(heading, justify="left" if heading == "stage" else "right")
+    total = [0.0] * len(next(iter(stage_ms.values())))
+    for stage, times in stage_ms.items():
+        total = [a + b for a, b in zip(total, times, strict=True)]
+        table.add_row(stage, f"{_median(times):.0f}", f"{max(times):.0f}")
+    table.add_row("all", f"{_median(total):.0f}", f"{max(total):.0f}", style="bold")
+    console.print(table)
+
+
+def _median(values: list[float]) -> float:
+    return sorted(values)[len(values) // 2]

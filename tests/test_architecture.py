@@ -1,0 +1,93 @@
+"""The house stays as it is drawn: layers, names, late imports, and what the README promises."""
+
+import importlib.metadata
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("surfclass", "drivers", "calibration", "daemon")
+
+
+def modules():
+    return [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+
+
+def test_imports_point_one_way():
+    result = subprocess.run(
+        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout
+
+
+def test_no_other_distribution_owns_our_names():
+    owners = importlib.metadata.packages_distributions()
+    for package in PACKAGES:
+        assert set(owners[package]) == {"surfclass"}
+
+
+@pytest.mark.parametrize(
+    ("module", "banned"),
+    [
+        ("surfclass.pipeline", {"sklearn", "open3d", "matplotlib", "pinocchio", "zenoh", "scipy", "mcap"}),
+        ("daemon.cli", {"numpy", "cv2", "sklearn", "open3d", "matplotlib", "pinocchio", "zenoh", "pydantic"}),
+    ],
+)
+def test_heavy_libraries_are_imported_late(module, banned):
+    """What --help and a console that only wants the values do not have to wait for."""
+    code = f"import sys, {module}; print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    ).stdout.split()
+    assert banned.isdisjoint(name.partition(".")[0] for name in loaded)
+
+
+def test_every_module_says_what_it_is_for():
+    for path in modules():
+        if not path.name.endswith("_pb2.py"):
+            assert path.read_text().startswith('"""'), path
+
+
+def test_modules_can_be_held_in_the_head():
+    lengths = {path: len(path.read_text().splitlines()) for path in modules() if "_pb2" not in path.name}
+    assert max(lengths.values()) <= 400, max(lengths, key=lengths.get)
+    assert sorted(lengths.values())[len(lengths) // 2] <= 170
+
+
+def test_no_module_has_a_name_that_says_nothing():
+    empty = {"utils", "util", "common", "helpers", "manager", "core", "misc"}
+    assert not {path.stem for path in modules()} & empty
+
+
+def test_the_readme_names_files_that_exist():
+    readme = (ROOT / "README.md").read_text()
+    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", readme)
+    assert len(links) > 8
+    for link in links:
+        assert (ROOT / link).exists(), link
+
+
+def test_the_tour_keeps_its_order():
+    readme = (ROOT / "README.md").read_text()
+    tour = re.findall(r"^\d\. \[`([^`]+)`\]", readme, re.MULTILINE)
+    assert tour == [
+        "surfclass/types.py",
+        "drivers/interfaces.py",
+        "drivers/sensor_package.py",
+        "surfclass/pipeline.py",
+        "daemon/service.py",
+    ]
+
+
+def test_the_decisions_are_all_listed():
+    pages = {path.name for path in (ROOT / "docs/decisions").glob("0*.md")}
+    listed = set(re.findall(r"\((0[^)]+)\)", (ROOT / "docs/decisions/README.md").read_text()))
+    assert pages == listed
