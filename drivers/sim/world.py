@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim import colour_camera, depth_camera, reflection
 from drivers.sim.arm import LIMITS, Motion, flange_pose
 from drivers.sim.clock import SimClock
 from drivers.sim.faults import DeviceName, Fault, FaultKind, Faults
 from drivers.sim.package import Package, standard_package
-from drivers.sim.randomness import stream
-from drivers.sim.raycast import Hits, cast, crop_of, faces_from
-from drivers.sim.scenes import Scene, Viewpoint, build, viewpoints
-from drivers.sim.surfaces import TEXEL_M, Texture, bake
+from drivers.sim.raycast import Hits
+from drivers.sim.renderer import Renderer
+from drivers.sim.scenes import Scene, build, viewpoints
+from drivers.sim.surfaces import Texture
+from drivers.sim.views import Viewpoint
 from surfclass.errors import ConfigurationError
 from surfclass.types import Float32, Float64, Transform
 
@@ -83,16 +83,13 @@ class SimWorld:
         self.ambient = ambient
         self.exposure_s = exposure_s
         self.began_ns = self.clock.now_ns()
-        self._texel_m = TEXEL_M / scale
-        self._textures: dict[int, Texture] = {}
+        self.renderer = Renderer(self.scene.surfaces, self.package, seed, scale)
         self._lock = threading.RLock()
-        self._rendering = threading.RLock()
         self._speed = speed_rad_s
         first = self.program[0] if self.program else self.viewpoints[0]
         self._motion = Motion(first.q, speed_rad_s)
         self._light = [_LightChange(self.began_ns, 0.0)]
         self._seen: list[int] = []  # ends of the exposures that the program waited for
-        self._last_colour: tuple[tuple[object, ...], Float32, Float32, Float32] | None = None
 
     # ---- time, faults, light ----------------------------------------------------------------
 
@@ -189,23 +186,19 @@ class SimWorld:
         """The depth camera's pose."""
         return flange_pose(q, self.package.flange_offset_m) @ self.package.flange_T_depth
 
-    # ---- images: functions of what they are given, whatever was drawn before -------------------
+    # ---- images -----------------------------------------------------------------------------
 
     def hits(self, q: Float64, camera: str) -> Hits:
-        """Returns what the pixels of camera "rgb" or "depth" see from `q`."""
-        if camera == "rgb":
-            return cast(faces_from(self.scene.surfaces, self.base_T_rgb(q).inverse), self.package.rgb_rays)
-        if camera == "depth":
-            faces = faces_from(self.scene.surfaces, self.base_T_depth(q).inverse)
-            return cast(faces, self.package.depth_rays)
-        raise ConfigurationError(f"camera {camera!r} of the simulated world, allowed: rgb, depth")
+        """Returns what the pixels of camera "rgb" or "depth" see from `q` (6,) rad."""
+        flange = flange_pose(q, self.package.flange_offset_m)
+        mounted = {"rgb": self.package.flange_T_rgb, "depth": self.package.flange_T_depth}
+        if camera not in mounted:
+            raise ConfigurationError(f"camera {camera!r} of the simulated world, allowed: rgb, depth")
+        return self.renderer.hits(flange @ mounted[camera])
 
     def texture(self, number: int) -> Texture:
-        """Returns the baked look of surface `number`; made when it is first seen."""
-        with self._rendering:
-            if number not in self._textures:
-                self._textures[number] = bake(self.scene.surfaces[number], self.seed, self._texel_m)
-            return self._textures[number]
+        """Returns the baked look of surface `number`."""
+        return self.renderer.texture(number)
 
     def irradiance(self, q: Float64, level: float = 1.0, exposure_s: float | None = None) -> Float32:
         """Returns (h, w, 3) linear light on the sensor as a fraction of full scale, without noise.
@@ -213,56 +206,21 @@ class SimWorld:
         Args:
             q: (6,) rad.
             level: Of the LED, 0…1.
-            exposure_s: Scales the image against the package's nominal exposure; the world's by default.
+            exposure_s: The world's by default.
         """
-        exposure = self.exposure_s if exposure_s is None else exposure_s
-        with self._rendering, self.clock.held():
-            lit, albedo, z = self._radiance(q)
-            light = np.float32(level) * lit + np.float32(self.ambient) * albedo
-            image = colour_camera.defocus(self.package, light, z)
-            image *= self.package.vignetting[..., None]
-            return image * np.float32(exposure / self.package.nominal_exposure_s)
+        with self.clock.held():
+            exposure = self.exposure_s if exposure_s is None else exposure_s
+            return self.renderer.irradiance(self.base_T_rgb(q), level, self.ambient, exposure)
 
     def render_colour(
         self, q: Float64, level: float, key: int, exposure_s: float | None = None
     ) -> NDArray[np.uint8]:
         """Returns the raw colour image (h, w, 3) of frame `key`, which only its noise depends on."""
-        with self._rendering, self.clock.held():
-            noise = stream(self.seed, "colour", key)
-            return colour_camera.expose(self.package, self.irradiance(q, level, exposure_s), noise)
+        with self.clock.held():
+            exposure = self.exposure_s if exposure_s is None else exposure_s
+            return self.renderer.colour(self.base_T_rgb(q), level, self.ambient, exposure, key)
 
     def render_depth(self, q: Float64, key: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """Returns depth (h, w) in mm and IR (h, w) in 0…1023 of frame `key`."""
-        with self._rendering, self.clock.held():
-            hits = self.hits(q, "depth")
-            present = set(np.unique(hits.face).tolist())
-            textures = [self.texture(n) if n in present else None for n in range(len(hits.faces))]
-            light, cosine = depth_camera.infrared(self.package, hits, textures, self.seed)
-            return depth_camera.measure(self.package, hits, light, cosine, stream(self.seed, "depth", key))
-
-    def _radiance(self, q: Float64) -> tuple[Float32, Float32, Float32]:
-        """Lit image at full level, albedo image and depth, before the lens; kept for a dark frame."""
-        key = (q.tobytes(),)
-        if self._last_colour is not None and self._last_colour[0] == key:
-            return self._last_colour[1:]
-        hits = self.hits(q, "rgb")
-        lit = np.zeros((*hits.z.shape, 3), np.float32)
-        albedo = np.zeros_like(lit)
-        for number in range(len(hits.faces)):
-            crop = crop_of(hits, number)
-            if crop is None:
-                continue
-            light, colour = reflection.reflected(
-                hits,
-                number,
-                crop,
-                self.package.rgb_rays,
-                self.texture(number),
-                self.package.led,
-                self.package.rgb.fx,
-            )
-            box = crop.rows, crop.columns
-            lit[box][crop.seen] = light[crop.seen]
-            albedo[box][crop.seen] = colour[crop.seen]
-        self._last_colour = (key, lit, albedo, hits.z)
-        return lit, albedo, hits.z
+        with self.clock.held():
+            return self.renderer.depth(self.base_T_depth(q), key)
