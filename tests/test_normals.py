@@ -87,6 +87,13 @@ def test_no_normal_is_averaged_across_a_jump():
     assert result.valid.mean() > 0.99
 
 
+def test_a_step_of_20_mm_costs_no_normals():
+    """A block takes only a plane that it lies on itself, though the one beside it is as thin."""
+    near = Plane((0, 0, -1.0), -0.8, (-0.15, -0.1), (0.15, 0.1))
+    depth, _ = cast([near, Plane((0, 0, -1.0), -0.82)], CAMERA)
+    assert estimate_normals(as_mm(depth), CAMERA).valid.all()
+
+
 def test_normals_reach_up_to_a_crease():
     """A right-angled corner: eccentric windows serve the pixels that a centred window spoils."""
     c = np.sqrt(0.5)

@@ -96,5 +96,5 @@ def test_sides_of_a_crease_are_not_averaged():
     view = view_surface(as_mm(cast(walls, rig.depth)[0], quantised=False), rig)
     seen = view.normal[:, view.has_normal]
     best = np.max([np.array(wall.normal) @ seen for wall in walls], axis=0)
-    assert best.min() > np.cos(np.radians(26))
+    assert best.min() > np.cos(np.radians(10))
     assert view.has_normal.mean() > 0.9
