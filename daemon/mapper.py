@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
@@ -51,7 +51,7 @@ class Mapper:
     """Takes captures one by one; used from the service's thread only.
 
     A capture is on its way to disk before it is published. One that cannot be recorded is held, and
-    so is everything after it, until `unblock` lets it be tried again.
+    nothing may be taken after it until `unblock` has let it be tried again.
 
     Args:
         pipeline: Turns captures into map updates.
@@ -62,7 +62,7 @@ class Mapper:
     Attributes:
         blocked: Why nothing can be recorded; empty where it can, or where recording is off.
         unmapped: Why the last capture could not be mapped; empty where it could.
-        held: What waits for the recording, oldest first.
+        held: The capture that could not be recorded, while `blocked`.
         counts: recorded, mapped, unmapped, lost.
     """
 
@@ -77,7 +77,7 @@ class Mapper:
         self._sink, self._encode = sink, encode
         self.blocked = ""
         self.unmapped = ""
-        self.held: deque[Shot] = deque()
+        self.held: Shot | None = None
         self.counts: Counter[str] = Counter(recorded=0, mapped=0, unmapped=0, lost=0)
         self.times = StageTimes()
         self.last_error = LastError()
@@ -136,9 +136,11 @@ class Mapper:
         if shot.request is not None:
             shot.request.refuse("the service is stopping; the capture was not mapped")
 
-    def unblock(self) -> None:
-        """Lets what is held be tried again."""
+    def unblock(self) -> Shot | None:
+        """Returns what was held, if anything, to be taken again."""
         self.blocked = ""
+        shot, self.held = self.held, None
+        return shot
 
     def _record(self, capture: Capture) -> None:
         if self._sink is not None:
@@ -155,7 +157,7 @@ class Mapper:
             shot.request.refuse(self.unmapped)
 
     def _hold(self, shot: Shot, error: OSError) -> None:
-        self.held.appendleft(shot)
+        self.held = shot
         self.blocked = f"recording: {error}"
         self.last_error.note(self.blocked)
         log(_log, logging.ERROR, "recording failed; captures are held until a reload", error=error)

@@ -137,7 +137,7 @@ class Service:
             "acquisition": acquisition.phase.value,
             "counts": {**acquisition.counts, "refused": self._requests.refused, **self._mapper.counts},
             "waiting": {
-                "captures": self._shots.qsize() + len(self._mapper.held),
+                "captures": self._shots.qsize() + (self._mapper.held is not None),
                 "requests": len(self._requests),
             },
             "stage_ms": self._mapper.times.medians(),
@@ -194,9 +194,7 @@ class Service:
         running = self._acquisition.alive  # before the queue is looked at: what it put in is there
         shot = self._next_shot()
         if shot is not None:
-            self._mapper.take(shot)
-            if self._mapper.blocked:
-                self._requests.close(f"failed: {self._mapper.blocked}")
+            self._take(shot)
             return True
         if self._acquisition.error is not None and not running:
             raise self._acquisition.error
@@ -211,12 +209,15 @@ class Service:
             return True
         return running and not self._mapper.blocked and not self._stalled()
 
+    def _take(self, shot: Shot) -> None:
+        self._mapper.take(shot)
+        if self._mapper.blocked:
+            self._requests.close(f"failed: {self._mapper.blocked}")
+
     def _next_shot(self) -> Shot | None:
         if self._mapper.blocked:
             time.sleep(_TICK_S)
             return None
-        if self._mapper.held:
-            return self._mapper.held.popleft()
         try:
             return self._shots.get(timeout=_TICK_S)
         except queue.Empty:
@@ -282,9 +283,11 @@ class Service:
             log(_log, logging.ERROR, "reload refused; everything stays as it was", error=error)
         else:
             log(_log, logging.INFO, "reloaded", changes=told or "none")
-        if self._mapper.blocked:  # what is held is tried again now, and fails again or goes on
-            self._mapper.unblock()
+        if self._mapper.blocked:
             self._requests.reopen()
+            held = self._mapper.unblock()
+            if held is not None:
+                self._take(held)
         self._acquisition.reload()
         self._status_line = told
         notify("READY=1", f"STATUS={told}" if told else "STATUS=reloaded")
@@ -330,7 +333,7 @@ class Service:
         while time.monotonic() < until:
             running = self._acquisition.alive
             try:
-                shot = self._mapper.held.popleft() if self._mapper.held else self._shots.get(timeout=_TICK_S)
+                shot = self._mapper.unblock() or self._shots.get(timeout=_TICK_S)
             except queue.Empty:
                 if not running:
                     self._failed_end |= self._mapper.counts["lost"] > 0

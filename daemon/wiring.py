@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("surfclass.wiring")
 
+_SIMULATED_S = 120.0
+
 # Views of the place itself; boards and calibration targets stood elsewhere, at other times.
 MAP_ROLES = ("map", "test")
 
@@ -269,6 +271,11 @@ def build_service(
     acquisition = Acquisition(
         source, requests, shots, dark=config.capture.dark, finite=config.replay is not None, jump=jump
     )
+    limits = config.limits
+    if world is not None:
+        # A simulated exposure is computed, and the first one bakes all textures: slow, but no hang.
+        slow = {name: max(_SIMULATED_S, getattr(limits, name)) for name in ("heartbeat_s", "stop_s")}
+        limits = limits.model_copy(update=slow)
     meta = MapMeta.of(pipeline.map).model_dump()
     publisher = MapPublisher(session, config.robot, meta, pipeline.map.snapshot)
     service = Service(
@@ -277,7 +284,7 @@ def build_service(
         publisher=publisher,
         requests=requests,
         shots=shots,
-        limits=config.limits,
+        limits=limits,
         robot=config.robot,
         sink=sink,
         encode=encode_update,

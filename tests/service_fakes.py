@@ -131,14 +131,30 @@ class Writer:
 class Rig:
     """A service out of fakes, run in a thread."""
 
-    def __init__(self, tmp_path, script=(), *, opens=(), finite=False, recording=True, dark=False, **options):
+    def __init__(
+        self,
+        tmp_path,
+        script=(),
+        *,
+        opens=(),
+        finite=False,
+        recording=True,
+        dark=False,
+        backoff=None,
+        **options,
+    ):
         self.events = []
         limits = Limits(**{"request_s": 5.0, "stop_s": 5.0, **options.pop("limits", {})})
         self.source = Source(script, self.events, opens, finite)
         self.requests = RequestQueue(limits.waiting_requests, limits.request_s)
         self.shots = queue.Queue(limits.waiting_captures)
         self.acquisition = Acquisition(
-            self.source, self.requests, self.shots, dark=dark, finite=finite, backoff=Backoff(0.01, 0.02)
+            self.source,
+            self.requests,
+            self.shots,
+            dark=dark,
+            finite=finite,
+            backoff=backoff or Backoff(0.01, 0.02),
         )
         self.pipeline, self.publisher = Pipeline(self.events), Publisher(self.events)
         self.disk_fault = []
