@@ -67,12 +67,10 @@ def test_depth_comes_in_steps_of_an_eighth_of_a_pixel_of_disparity(card):
     levels = np.unique(depth[depth > 0])
     disparity = depth_camera.disparity_per_metre(card.package) / levels
     # Millimetre rounding moves a level by up to half a millimetre.
-    slack = 0.00051 * disparity / levels / depth_camera.DISPARITY_STEP_PX
-    off = np.abs(
-        disparity / depth_camera.DISPARITY_STEP_PX - np.round(disparity / depth_camera.DISPARITY_STEP_PX)
-    )
+    slack = 0.00051 * disparity / levels * 8
+    off = np.abs(8 * disparity - np.round(8 * disparity))
     assert (off <= slack + 1e-6).all()
-    assert np.median(np.diff(levels)) > 0.003
+    assert np.median(np.diff(np.round(8 * disparity))) == -1
 
 
 def test_neighbours_share_their_noise(card):

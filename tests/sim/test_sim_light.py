@@ -17,11 +17,6 @@ def card():
     return SimWorld("grey_card", scale=SCALE)
 
 
-@pytest.fixture(scope="module")
-def cell():
-    return SimWorld("cell", scale=SCALE)
-
-
 def view(world, name):
     return next(one for one in world.viewpoints if one.name == name)
 
@@ -80,36 +75,46 @@ def test_ambient_light_is_there_without_the_led():
     assert dark == pytest.approx(0.05 * 0.5 * world.package.vignetting[..., None] + 0 * dark, rel=1e-3)
 
 
-def test_a_shadow_is_where_the_line_to_the_light_is_blocked(cell):
+@pytest.mark.parametrize(
+    ("scene", "name"),
+    [
+        ("cell", "corner_090"),
+        ("cell", "lower_075"),
+        ("checkerboard", "tilt_04"),
+        ("reflector_discs", "tilt_00"),
+    ],
+)
+def test_a_shadow_is_where_the_line_to_the_light_is_blocked(scene, name):
     """Against brute force: a ray from each place to the LED, tested with every rectangle."""
-    q = view(cell, "corner_090").q
-    seen = truth.surface(cell, q)
-    lit = cell.irradiance(q).max(axis=2) > 1e-4
-    light = cell.base_T_rgb(q) @ np.array(cell.package.led.position_m)
-    points = (cell.base_T_rgb(q) @ seen.point.transpose(1, 2, 0)).astype(np.float64)
-    normals = seen.normal.transpose(1, 2, 0) @ cell.base_T_rgb(q).rotation.T
+    world = SimWorld(scene, scale=0.2)
+    q = view(world, name).q
+    seen = truth.surface(world, q)
+    image = world.irradiance(q).max(axis=2)
+    light = world.base_T_rgb(q) @ np.array(world.package.led.position_m)
+    points = (world.base_T_rgb(q) @ seen.point.transpose(1, 2, 0)).astype(np.float64)
+    normals = seen.normal.transpose(1, 2, 0) @ world.base_T_rgb(q).rotation.T
     facing = ((light - points) * normals).sum(axis=2)
-    blocked, near_shadow = facing <= 0, np.zeros(facing.shape, bool)
-    for one in cell.scene.surfaces:
+    well_inside, near_shadow = np.zeros(facing.shape, bool), np.zeros(facing.shape, bool)
+    for one in world.scene.surfaces:
         to_light = light - points
         with np.errstate(divide="ignore", invalid="ignore"):
             part = ((one.corner - points) @ one.normal) / (to_light @ one.normal)
         crossing = points + part[..., None] * to_light - one.corner
         s, t = crossing @ one.along_s, crossing @ one.along_t
-        ahead = (part > 1e-3) & (part < 1)
-        for grow, hidden in ((0.0, blocked), (0.004, near_shadow)):
+        ahead = (part > 2e-3) & (part < 1)
+        # The LED's disc, seen from the surface, is a disc of this radius where the ray crosses.
+        penumbra = world.package.led.radius_m * part + 1e-3
+        for grow, hidden in ((-penumbra, well_inside), (penumbra + 0.003, near_shadow)):
             inside = (s > -grow) & (s < one.size_m[0] + grow) & (t > -grow) & (t < one.size_m[1] + grow)
             hidden |= ahead & inside
-    clear = seen.hit & ~blocked & ~near_shadow & (facing > 0.02)
-    assert 0.02 < blocked.mean() < 0.5
-    # Blur and penumbra touch the borders; the inside must agree.
-    assert lit[clear].mean() > 0.995
-    core = blocked & seen.hit
-    for shift in (-2, 2):
-        core &= np.roll(blocked, shift, 0) & np.roll(blocked, shift, 1)
-    assert core.sum() > 50
-    dark = cell.irradiance(q).max(axis=2)[core]
-    assert np.percentile(dark, 90) < 0.02
+    # Defocus mixes neighbours, so only places whose surroundings are alike are asked.
+    alike = np.ones((5, 5))
+    dark = cv2.erode((well_inside & seen.hit).astype(np.uint8), alike) > 0
+    clear = cv2.erode((seen.hit & ~near_shadow & (facing > 0.05)).astype(np.uint8), alike) > 0
+    assert dark.sum() > 30
+    assert np.percentile(image[dark], 95) < 2e-4
+    assert clear.mean() > 0.3
+    assert image[clear].min() > 5e-4
 
 
 def test_the_highlight_is_where_the_mirror_direction_is():

@@ -106,6 +106,14 @@ def test_the_arm_dwells_before_it_leaves_and_counts_a_stop_once():
         assert world.program_done
 
 
+def test_an_exposure_while_something_else_moves_the_arm_is_no_handshake():
+    world = program_world()
+    world.move_to(world.viewpoints[5].q)
+    with SimColourCamera(world) as camera, SimLight(world) as light:
+        camera.grab(light.set_level(1.0), 1.0)
+    assert world.program_index == 0
+
+
 def test_without_a_program_the_arm_stays():
     world = SimWorld("grey_card", scale=0.05)
     assert world.program_done
