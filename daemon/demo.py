@@ -163,7 +163,7 @@ def _process(log: Path, arguments: list[str]) -> Iterator[subprocess.Popen[bytes
     """Runs a command of this program; it is gone at the end, whatever happens."""
     with log.open("wb") as stream:
         process = subprocess.Popen(
-            [sys.executable, "-m", "daemon.cli", *arguments],
+            [sys.executable, "-m", "daemon", *arguments],
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=stream,

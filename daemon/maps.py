@@ -27,10 +27,13 @@ def show(path: Path, png: Path | None, ply: Path | None, classes_path: Path | No
     found = load_map(path)
     classes = _classes(found, classes_path)
     layers = found.layers
-    counts = np.bincount(layers.p.argmax(axis=1), minlength=len(classes.names))
+    known = layers.p.max(axis=1) > 1 / len(classes.names) + 1e-6
+    counts = np.bincount(layers.p[known].argmax(axis=1), minlength=len(classes.names))
     console.print(f"{path}: {len(layers.index):,} voxels of {found.voxel_size_m * 1000:g} mm")
     for name, count in zip(classes.names, counts, strict=True):
         console.print(f"  {name:<12} {count:>8,}")
+    if not known.all():
+        console.print(f"  {'unknown':<12} {np.sum(~known):>8,}")
     if png is not None:
         pictures.draw_map(png, layers, found.voxel_size_m, classes.names, classes.rgb)
         console.print(f"{png}: picture")

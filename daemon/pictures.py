@@ -27,7 +27,7 @@ def draw_voxels(
     size_m: float,
     colour: NDArray[np.uint8],
     eye_direction: Float64,
-    shape: tuple[int, int] = (720, 960),
+    width: int = 1100,
 ) -> RGB:
     """Draws voxels as shaded cubes, seen from afar (orthographic), z up.
 
@@ -36,11 +36,10 @@ def draw_voxels(
         size_m: Their side.
         colour: (n, 3) RGB.
         eye_direction: (3,) from the voxels to the eye; not vertical.
-        shape: (height, width) of the picture.
+        width: Of the picture, px; its height follows from what there is to see, up to the width.
     """
-    picture = np.full((*shape, 3), _BACKGROUND, np.uint8)
     if not len(index):
-        return picture
+        return np.full((width // 2, width, 3), _BACKGROUND, np.uint8)
     towards = np.asarray(eye_direction, np.float64) / np.linalg.norm(eye_direction)
     right = np.cross([0, 0, 1], towards)
     right /= np.linalg.norm(right)
@@ -48,9 +47,10 @@ def draw_voxels(
     centre = (index + 0.5) * size_m
     flat = centre @ axes.T
     low, high = flat.min(axis=0) - size_m, flat.max(axis=0) + size_m
-    scale = float(min((shape[1] - 20) / (high[0] - low[0]), (shape[0] - 20) / (high[1] - low[1])))
-    middle = (low + high) / 2
-    offset = np.array([shape[1], shape[0]]) / 2 - middle * scale
+    extent = high - low
+    scale = (width - 20) / float(extent.max())
+    picture = np.full((int(extent[1] * scale) + 20, width, 3), _BACKGROUND, np.uint8)
+    offset = np.array([width, picture.shape[0]]) / 2 - (low + high) / 2 * scale
     occupied = {tuple(voxel) for voxel in index.tolist()}
     visible = []
     for axis, sign, corners in _FACES:
@@ -72,7 +72,7 @@ def draw_voxels(
 
 
 def draw_map(path: Path, layers: Any, size_m: float, names: tuple[str, ...], class_rgb: RGB) -> None:
-    """Writes a picture of a map: its classes from two sides, its confidence, and a legend.
+    """Writes a picture of a map: its classes, their probability, and a legend.
 
     Args:
         path: The PNG to write.
@@ -88,17 +88,11 @@ def draw_map(path: Path, layers: Any, size_m: float, names: tuple[str, ...], cla
     class_colour = np.where(known[:, None], class_rgb[best], _UNKNOWN)
     shades = plt.get_cmap("viridis")(confidence)[:, :3]
     eye = _eye_direction(layers.index, size_m)
-    side = np.array([eye[0] * 0.2 - eye[1], eye[1] * 0.2 + eye[0], 0.5])
-    figure, axes = plt.subplots(1, 3, figsize=(17, 5.2), width_ratios=(1, 1, 1), layout="constrained")
-    pictures = [
-        ("surface type, seen from the robot", draw_voxels(layers.index, size_m, class_colour, eye)),
-        ("surface type, from the side", draw_voxels(layers.index, size_m, class_colour, side)),
-        (
-            "probability of that type",
-            draw_voxels(layers.index, size_m, (shades * 255).astype(np.uint8), eye),
-        ),
-    ]
-    for ax, (title, picture) in zip(axes, pictures, strict=True):
+    drawn = draw_voxels(layers.index, size_m, class_colour, eye)
+    sure = draw_voxels(layers.index, size_m, (shades * 255).astype(np.uint8), eye)
+    height = 8.5 * drawn.shape[0] / drawn.shape[1] + 1.2
+    figure, axes = plt.subplots(1, 2, figsize=(17, height), layout="constrained")
+    for ax, title, picture in zip(axes, ("surface type", "its probability"), (drawn, sure), strict=True):
         ax.imshow(picture, interpolation="antialiased")
         ax.set_title(title)
         ax.axis("off")
@@ -111,10 +105,10 @@ def draw_map(path: Path, layers: Any, size_m: float, names: tuple[str, ...], cla
         patches.append(
             plt.matplotlib.patches.Patch(color=_UNKNOWN / 255, label=f"unknown  {np.sum(~known):,}")
         )
-    axes[0].legend(handles=patches, loc="upper left", fontsize=8, framealpha=0.9)
+    figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), frameon=False)
     bar = plt.cm.ScalarMappable(cmap="viridis", norm=plt.Normalize(0, 1))
-    figure.colorbar(bar, ax=axes[2], fraction=0.035)
-    figure.suptitle(f"{len(best):,} voxels of {size_m * 1000:g} mm")
+    figure.colorbar(bar, ax=axes[1], fraction=0.025)
+    figure.suptitle(f"{len(best):,} voxels of {size_m * 1000:g} mm, seen from the robot's side")
     _save(figure, path)
 
 
