@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
+import json
 import logging
 import shutil
 import time
@@ -9,9 +12,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Protocol
 
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+from daemon.config import Config
+from daemon.files import read_file
 from daemon.logs import log
-from surfclass.errors import InputError
+from drivers.recording import RecordingWriter, unix_offset_ns
+from surfclass import map_pb2
+from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import Capture
+from surfclass.rig import SurfaceClasses
 
 _log = logging.getLogger("surfclass.recording")
 
@@ -137,3 +147,56 @@ class RecordingSink:
 def run_stem(robot: str) -> str:
     """Returns the name of a run that begins now: the robot and the time, UTC, to the second."""
     return f"{robot}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+
+
+def open_sink(config: Config, rig_text: str, classes: SurfaceClasses, epoch: str) -> RecordingSink | None:
+    """Returns where captures are kept, as configured; None where they are not.
+
+    Raises:
+        ConfigurationError: If the folder cannot be made.
+    """
+    if config.recording is None:
+        return None
+    told, stem = config.recording, run_stem(config.robot)
+    try:
+        told.directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"recording.directory {told.directory}: {error.strerror}") from None
+    for path in sorted(told.directory.glob("*.active")):
+        log(_log, logging.WARNING, "an earlier recording was cut off", mend=f"surfclass recover {path}")
+    metadata = {
+        "robot": config.robot,
+        "run": stem,
+        "epoch": epoch,
+        "software": f"surfclass {_version()}",
+        "model_sha256": hashlib.sha256(read_file(config.model, "model")).hexdigest(),
+    }
+    schema = FileDescriptorSet()
+    map_pb2.DESCRIPTOR.CopyToProto(schema.file.add())
+
+    def begin(path: Path, part: int) -> RecordingWriter:
+        return RecordingWriter(
+            path,
+            rig_text,
+            classes_toml(classes),
+            {**metadata, "part": str(part)},
+            # A simulated clock's times are nobody's Unix times.
+            unix_offset_ns=0 if config.simulated else unix_offset_ns(),
+            map_schema=schema.SerializeToString(deterministic=True),
+        )
+
+    return RecordingSink(told.directory, stem, begin, told.part_mb << 20, told.min_free_mb << 20)
+
+
+def classes_toml(classes: SurfaceClasses) -> str:
+    """Returns the classes as the text of a `classes.toml`."""
+    # TOML's basic strings have JSON's escapes.
+    names, colours = (json.dumps(list(values)) for values in (classes.names, classes.colours))
+    return f"names = {names}\ncolours = {colours}\n"
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("surfclass")
+    except importlib.metadata.PackageNotFoundError:
+        return "(not installed)"

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
-import json
 import logging
 import os
 import queue
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import zenoh
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from daemon import logs
 from daemon.acquisition import Acquisition, Shot
@@ -24,8 +20,8 @@ from daemon.files import read_file
 from daemon.notify import notify
 from daemon.publisher import MapPublisher
 from daemon.requests import RequestQueue
-from daemon.service import Service
-from daemon.sink import RecordingSink, run_stem
+from daemon.service import EXIT_FAILED, Service
+from daemon.sink import open_sink
 from daemon.transport import MapMeta, TransportError, open_session
 from drivers import backends
 from drivers.capture_source import (
@@ -37,22 +33,23 @@ from drivers.capture_source import (
     Trigger,
 )
 from drivers.clock import SystemClock
+from drivers.errors import DriverError
 from drivers.interfaces import Clock, Light
-from drivers.recording import Recording, RecordingWriter, unix_offset_ns
+from drivers.recording import Recording
 from drivers.replay import RecordingSource
 from drivers.sensor_package import SensorPackage, SensorSettings
-from surfclass import map_pb2
-from surfclass.errors import ConfigurationError
+from surfclass.errors import ConfigurationError, InputError
+from surfclass.kinematics import forward_kinematics
 from surfclass.map_file import to_npz_bytes
 from surfclass.model import Model
 from surfclass.pipeline import Pipeline, PipelineSettings
-from surfclass.rig import Rig, SurfaceClasses, parse_rig
+from surfclass.rig import Rig, parse_rig
 from surfclass.wire import encode_update
 
 if TYPE_CHECKING:
     from drivers.sim.world import SimWorld
 
-_log = logging.getLogger("surfclass.wiring")
+logger = logging.getLogger("surfclass.wiring")
 
 _SIMULATED_S = 120.0
 
@@ -196,44 +193,6 @@ def open_zenoh(config: Config) -> zenoh.Session:
     return open_session(told.mode, listen, told.connect, told.settings)
 
 
-def build_sink(config: Config, pipeline: Pipeline, simulated: bool) -> RecordingSink | None:
-    """Returns where captures are kept; None where they are not, or come from a recording anyway.
-
-    Raises:
-        ConfigurationError: If the folder cannot be made.
-    """
-    if config.recording is None or config.replay is not None:
-        return None
-    told, stem = config.recording, run_stem(config.robot)
-    try:
-        told.directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"recording.directory {told.directory}: {error.strerror}") from None
-    rig_text, classes_text = rig_of(config)[0], classes_toml(pipeline.model.classes)
-    metadata = {
-        "robot": config.robot,
-        "run": stem,
-        "epoch": pipeline.map.epoch,
-        "software": f"surfclass {_version()}",
-        "model_sha256": hashlib.sha256(read_file(config.model, "model")).hexdigest(),
-    }
-    schema = FileDescriptorSet()
-    map_pb2.DESCRIPTOR.CopyToProto(schema.file.add())
-
-    def begin(path: Path, part: int) -> RecordingWriter:
-        return RecordingWriter(
-            path,
-            rig_text,
-            classes_text,
-            {**metadata, "part": str(part)},
-            # A simulated clock's times are nobody's Unix times.
-            unix_offset_ns=0 if simulated else unix_offset_ns(),
-            map_schema=schema.SerializeToString(deterministic=True),
-        )
-
-    return RecordingSink(told.directory, stem, begin, told.part_mb << 20, told.min_free_mb << 20)
-
-
 def build_service(
     config: Config,
     session: zenoh.Session,
@@ -257,8 +216,13 @@ def build_service(
         raise ConfigurationError(f"map: there is no folder {config.map.parent}")
     pipeline = build_pipeline(config)
     sensors = build_sensors(config) if config.replay is None else None
+    if sensors is not None and "arm" in sensors.devices:
+        # Loads and builds the arm's model now, and not with the first capture.
+        forward_kinematics(np.zeros(6), pipeline.rig.arm.flange_offset_m)
     world = None if sensors is None else sensors.world
-    sink = build_sink(config, pipeline, simulated=world is not None)
+    sink = None
+    if sensors is not None:  # what comes from a recording is recorded already
+        sink = open_sink(config, rig_of(config)[0], pipeline.model.classes, pipeline.map.epoch)
     requests = RequestQueue(config.limits.waiting_requests, config.limits.request_s)
     shots: queue.Queue[Shot] = queue.Queue(config.limits.waiting_captures)
     source: CaptureSource
@@ -348,10 +312,18 @@ def run(load: Callable[[], Config], *, exit_when_done: bool = False) -> int:
     try:
         with open_zenoh(config) as session:
             return build_service(config, session, load=load, exit_when_done=exit_when_done).run()
+    except (InputError, DriverError):
+        raise  # the command line says it in one line
+    except ImportError as error:
+        logs.log(logger, logging.CRITICAL, "not installed", error=error)
+        return os.EX_CONFIG
     except TransportError as error:
-        logs.log(_log, logging.CRITICAL, "no way to the consoles", error=error)
+        logs.log(logger, logging.CRITICAL, "no way to the consoles", error=error)
         notify(f"STATUS={error}")
         return os.EX_UNAVAILABLE
+    except Exception:
+        logger.exception("the service broke")
+        return EXIT_FAILED
 
 
 def lights_off(config: Config) -> None:
@@ -367,17 +339,3 @@ def lights_off(config: Config) -> None:
         )
         with light:  # off after open, and off in close
             light.set_level(0.0)
-
-
-def classes_toml(classes: SurfaceClasses) -> str:
-    """Returns the classes as the text of a `classes.toml`."""
-    # TOML's basic strings have JSON's escapes.
-    names, colours = (json.dumps(list(values)) for values in (classes.names, classes.colours))
-    return f"names = {names}\ncolours = {colours}\n"
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("surfclass")
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"

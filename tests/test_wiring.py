@@ -10,78 +10,21 @@ import time
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
 import pytest
+from service_site import build_site
 
 from daemon import check, wiring
 from daemon.check import Verdict
 from daemon.config import load_config
 from daemon.transport import TransportError, ask, open_session
 from drivers.recording import Recording
-from drivers.sim import truth
-from drivers.sim.world import SimWorld
-from surfclass.classifiers import naive_bayes
 from surfclass.errors import ConfigurationError
-from surfclass.model import Model
-from surfclass.rig import parse_classes
-from surfclass.routes import ColourRoute, TextureRoute
 from surfclass.wire import decode_update
-
-SCALE = 0.1  # images of 128 × 96: what is tested here is the wiring
-
-CONFIG = """
-robot = "test"
-rig = "rig.toml"
-model = "model.npz"
-map = "map.npz"
-[trigger.rest]
-[recording]
-directory = "recordings"
-min_free_mb = 1
-[zenoh]
-listen = ["ENDPOINT"]
-[colour]
-backend = "sim"
-[depth]
-backend = "sim"
-[light]
-backend = "sim"
-[arm]
-backend = "sim"
-[sim]
-scale = SCALE
-viewpoints = 2
-"""
-
-
-def any_classifier(dimensions):
-    """A classifier that rejects next to nothing; what it says does not matter here."""
-    draw = np.random.default_rng(0)
-    x = draw.random((500, dimensions))
-    return naive_bayes.train(x, np.arange(500) % 5, rejected_share=1e-9)
-
-
-@pytest.fixture(scope="session")
-def parts():
-    world = SimWorld("cell", 0, scale=SCALE)
-    rig = truth.rig(world).replace('colour = "K_d"', 'colour = "RGB"')
-    rig = re.sub(r"\[lens\]\n(\w+ = .*\n)*", "", rig)
-    classes = parse_classes(truth.classes_toml(), "classes")
-    colour = ColourRoute("RGB", "thesis", None, any_classifier(3), None)
-    model = Model(classes, {"RGB": colour}, TextureRoute("LBP", 20, any_classifier(59)))
-    return rig, model.to_bytes()
 
 
 @pytest.fixture
-def site(tmp_path, parts):
-    """A folder with all that a service needs, simulated."""
-    rig, model = parts
-    (tmp_path / "rig.toml").write_text(rig)
-    (tmp_path / "model.npz").write_bytes(model)
-    endpoint = f"unixsock-stream/{tmp_path}/z"
-    text = CONFIG.replace("ENDPOINT", endpoint).replace("SCALE", str(SCALE))
-    (tmp_path / "surfclass.toml").write_text(text)
-    return tmp_path
+def site(tmp_path):
+    return build_site(tmp_path)
 
 
 class Running:
@@ -189,6 +132,15 @@ def test_reload_takes_over_the_trigger_and_names_what_it_cannot(site):
     (path,) = (site / "recordings").iterdir()
     names = [capture.name for capture in Recording.open(path).captures()]
     assert names == [f"{number:06d}" for number in range(1, len(names) + 1)]
+
+
+def test_a_recording_that_a_crash_left_is_named(site, caplog):
+    (site / "recordings").mkdir()
+    (site / "recordings" / "old.mcap.active").write_bytes(b"")
+    with caplog.at_level("WARNING"), Running(site):
+        pass
+    told = next(record for record in caplog.records if "cut off" in record.message)
+    assert told.fields == {"mend": f"surfclass recover {site}/recordings/old.mcap.active"}
 
 
 def test_what_a_reload_says():
