@@ -1,6 +1,5 @@
 """A folder with all that a simulated service needs; for tests that run the real one."""
 
-import re
 from functools import cache
 
 import numpy as np
@@ -51,7 +50,6 @@ def parts():
     """Returns the text of a rig and the bytes of a model that fits it."""
     world = SimWorld("cell", 0, scale=SCALE)
     rig = truth.rig(world).replace('colour = "K_d"', 'colour = "RGB"')
-    rig = re.sub(r"\[lens\]\n(\w+ = .*\n)*", "", rig)
     classes = parse_classes(truth.classes_toml(), "classes")
     colour = ColourRoute("RGB", "thesis", None, any_classifier(3), None)
     model = Model(classes, {"RGB": colour}, TextureRoute("LBP", 20, any_classifier(59)))
