@@ -275,11 +275,12 @@ def test_missing_hardware_is_waited_for(tmp_path):
 
 
 def test_a_lost_device_is_opened_again_and_the_request_survives(tmp_path):
-    with Rig(tmp_path, [lambda: None]) as rig:
-        rig.until(lambda: rig.source.is_open)
+    with Rig(tmp_path) as rig:
+        leave = held_up(rig)
+        request = rig.requests.offer({"name": "kept"})
         rig.source.script.append(DeviceLostError("depth", "unplugged"))
-        answer = rig.service.capture({"name": "kept"})
-    assert answer["name"] == "kept"
+        leave.set()
+        assert request.answer.result(5)["name"] == "kept"
     assert in_order(rig.events, "open", "close source", "open", "record kept")
 
 
