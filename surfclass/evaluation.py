@@ -227,7 +227,7 @@ def benchmark_of(
         view = view_surface(capture.depth.depth_mm, rig)
         chosen = view.has_point & (label > 0)
         base_T_rgb = depth_pose(capture, rig) @ rig.rgb_T_depth.inverse
-        benchmark.add(base_T_rgb @ view.point[:, chosen].T, label[chosen])
+        benchmark.add(base_T_rgb.move_planes(view.point[:, chosen]).T, label[chosen])
     if empty:
         raise InputError("there is no capture of role 'test' to evaluate")
     return benchmark

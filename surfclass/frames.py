@@ -139,3 +139,7 @@ class Capture:
 
 
 ROLES = ("train", "test", "map", "light", "response", "exposure", "hand_eye", "board")
+
+# What goes into a map: views of the place itself. Training boards and calibration targets may stand
+# anywhere, at other times.
+MAP_ROLES = ("map", "test")

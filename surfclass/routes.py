@@ -105,19 +105,20 @@ class ColourRoute:
         flat = features.reshape(len(features), -1)
         usable = valid.reshape(-1)
         everywhere = bool(usable.all())
-        chosen = flat if everywhere else flat[:, usable]
+        rows = np.flatnonzero(usable)
+        chosen = flat if everywhere else flat.take(rows, axis=1, mode="clip")
         rejected = np.zeros(usable.shape, bool)
         if self.table is not None:
             found = self.table.lookup(chosen)
         else:
             found = self.classifier.posterior(chosen.T.astype(np.float64)).astype(np.float32)
             if isinstance(self.classifier, NaiveBayes):
-                rejected[usable] = self.classifier.rejects(chosen.T.astype(np.float64))
+                rejected[rows] = self.classifier.rejects(chosen.T.astype(np.float64))
         if everywhere:
             probability = found
         else:
             probability = np.zeros((usable.size, found.shape[1]), np.float32)
-            probability[usable] = found
+            probability[rows] = found
         if rejected.any():
             probability[rejected] = 0
         shape = image.shape[:2]

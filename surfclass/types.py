@@ -98,6 +98,13 @@ class Transform:
         moved: NDArray[Any] = other @ self.rotation.T.astype(kind) + self.translation.astype(kind)
         return moved
 
+    def move_planes(self, planes: Float32) -> Float32:
+        """Returns (3, …) coordinates, held as planes x, y, z, moved from `src` to `dst`."""
+        flat = planes.reshape(3, -1)
+        moved: Float32 = self.rotation.astype(np.float32) @ flat
+        moved += self.translation.astype(np.float32)[:, None]
+        return moved.reshape(planes.shape)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceView:
