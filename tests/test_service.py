@@ -15,6 +15,7 @@ from daemon.recovery import POLICY, Backoff, Remedy, remedy
 from daemon.requests import CommandError, RequestQueue
 from drivers.capture_source import CaptureRequest
 from drivers.errors import (
+    CaptureRejectedError,
     DeviceFaultError,
     DeviceLostError,
     DeviceNotFoundError,
@@ -22,7 +23,6 @@ from drivers.errors import (
     DriverError,
     DriverUnavailableError,
 )
-from drivers.sensor_package import CaptureRejectedError
 from surfclass.errors import InputError
 
 
@@ -350,10 +350,12 @@ def test_a_missing_vendor_library_ends_with_78(tmp_path):
 
 def test_a_rejected_capture_is_no_device_error(tmp_path):
     with Rig(tmp_path) as rig:
-        rig.until(lambda: rig.source.is_open)
+        leave = held_up(rig)
+        request = rig.requests.offer({})
         rig.source.script.append(CaptureRejectedError("the arm moved 0.02 rad", "motion"))
+        leave.set()
         with pytest.raises(CommandError, match=r"rejected: .*arm moved"):
-            rig.service.capture({})
+            request.answer.result(5)
         assert rig.health() == "ok"
     assert rig.acquisition.counts["rejected"] == 1
     assert rig.acquisition.counts["device_errors"] == 0
