@@ -14,8 +14,7 @@ from daemon.logs import log
 from daemon.recovery import Backoff, Remedy, remedy
 from daemon.requests import Request, RequestQueue
 from drivers.capture_source import CaptureRequest, CaptureSource
-from drivers.errors import DriverError
-from drivers.sensor_package import CaptureRejectedError
+from drivers.errors import CaptureRejectedError, DriverError
 from surfclass.errors import InputError
 from surfclass.frames import Capture
 

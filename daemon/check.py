@@ -18,6 +18,7 @@ import numpy as np
 from daemon import wiring
 from daemon.config import Config
 from drivers.errors import (
+    CaptureRejectedError,
     DeviceFaultError,
     DeviceLostError,
     DeviceNotFoundError,
@@ -26,7 +27,6 @@ from drivers.errors import (
     DriverUnavailableError,
 )
 from drivers.recording import Recording
-from drivers.sensor_package import CaptureRejectedError
 from surfclass.errors import InputError
 from surfclass.pipeline import Pipeline
 
@@ -83,7 +83,7 @@ def check(config: Config) -> list[Finding]:
     _check_packages(note)
     _check_paths(config, note)
     pipeline: Pipeline | None = None
-    with note.faults_of("rig and model", "correct the file; `surfclass calibrate` fills in what is missing"):
+    with note.faults_of("rig and model", "correct the file that the message names"):
         pipeline = wiring.build_pipeline(config)
         names = ", ".join(pipeline.model.classes.names)
         features = pipeline.rig.features

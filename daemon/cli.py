@@ -329,7 +329,7 @@ def _settings(thesis: bool, update: Update | None, pool: Pool | None) -> Pipelin
 
 def main() -> None:
     """Runs the command line; errors that people can mend are one message, without a traceback."""
-    from drivers.errors import DriverError, DriverUnavailableError
+    from drivers.errors import CaptureRejectedError, DriverError, DriverUnavailableError
     from surfclass.errors import ConfigurationError, InputError
 
     try:
@@ -340,7 +340,7 @@ def main() -> None:
         sys.exit(_say(error, EXIT_USAGE))
     except DriverUnavailableError as error:
         sys.exit(_say(error, EXIT_CONFIGURATION))
-    except DriverError as error:
+    except (DriverError, CaptureRejectedError) as error:
         sys.exit(_say(error, EXIT_DEVICE))
     except BrokenPipeError:
         # The reader of our standard output has gone; nothing is left to say, to nobody.

@@ -18,15 +18,12 @@ from drivers.folder import read_folder
 from drivers.recording import Recording, RecordingWriter
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.evaluation import ROUTES, SCHEMA, benchmark_of, evaluate, score_layers
+from surfclass.frames import MAP_ROLES
 from surfclass.kinematics import depth_pose
 from surfclass.map_file import MapFile, from_npz_bytes, to_npz_bytes
 from surfclass.model import Model
 from surfclass.pipeline import Pipeline, PipelineSettings
 from surfclass.training import TrainingSettings, train
-
-# What goes into a map: views of the place itself. Training boards and calibration targets may stand
-# anywhere, at other times.
-MAP_ROLES = ("map", "test")
 
 console = Console(stderr=True)
 

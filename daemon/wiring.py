@@ -39,6 +39,7 @@ from drivers.recording import Recording
 from drivers.replay import RecordingSource
 from drivers.sensor_package import SensorPackage, SensorSettings
 from surfclass.errors import ConfigurationError, InputError
+from surfclass.frames import MAP_ROLES
 from surfclass.kinematics import forward_kinematics
 from surfclass.map_file import to_npz_bytes
 from surfclass.model import Model
@@ -52,9 +53,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger("surfclass.wiring")
 
 _SIMULATED_S = 120.0
-
-# Views of the place itself; boards and calibration targets stood elsewhere, at other times.
-MAP_ROLES = ("map", "test")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
 
+from drivers.errors import CaptureRejectedError
 from drivers.interfaces import Clock
-from drivers.sensor_package import CaptureRejectedError, SensorPackage
+from drivers.sensor_package import SensorPackage
 from drivers.triggers import IntervalTrigger, RequestTrigger, RestTrigger, Trigger
 from surfclass.frames import Capture
 

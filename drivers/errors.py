@@ -1,4 +1,6 @@
-"""The five errors that leave a driver; the class is the recovery policy."""
+"""The five errors that leave a driver, whose class is the recovery policy; and the rejection of a capture."""
+
+from typing import Literal
 
 
 class DriverError(Exception):
@@ -27,3 +29,16 @@ class DeviceFaultError(DriverError):
 
 class DriverUnavailableError(DriverError, ImportError):
     """A vendor library is missing; the message names the package. Policy: exit 78."""
+
+
+class CaptureRejectedError(Exception):
+    """What was taken is no capture, though every device works; the same request may be made again.
+
+    Attributes:
+        reason: "motion" (the arm moved), "skew" (colour and depth are too far apart in time), or
+            "stale" (a frame or a joint reading is not of the time that it was asked for).
+    """
+
+    def __init__(self, message: str, reason: Literal["motion", "skew", "stale"]) -> None:
+        super().__init__(message)
+        self.reason = reason

@@ -5,29 +5,16 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from types import TracebackType
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
-from drivers.errors import DeviceFaultError, DeviceLostError
+from drivers.errors import CaptureRejectedError, DeviceFaultError, DeviceLostError
 from drivers.interfaces import Arm, Clock, ColourCamera, DepthCamera, Device, Light
 from surfclass.errors import ConfigurationError
 from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
 
 _ROUNDING_NS = 1_000  # of mid-exposure and exposure time, when the start is computed back from them
-
-
-class CaptureRejectedError(Exception):
-    """What was taken is no capture, though every device works; the same request may be made again.
-
-    Attributes:
-        reason: "motion" (the arm moved), "skew" (colour and depth are too far apart in time), or
-            "stale" (a frame or a joint reading is not of the time that it was asked for).
-    """
-
-    def __init__(self, message: str, reason: Literal["motion", "skew", "stale"]) -> None:
-        super().__init__(message)
-        self.reason = reason
 
 
 @dataclass(frozen=True, slots=True)

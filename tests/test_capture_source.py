@@ -22,10 +22,10 @@ from drivers.capture_source import (
     Trigger,
 )
 from drivers.clock import SystemClock
-from drivers.errors import DriverUnavailableError
+from drivers.errors import CaptureRejectedError, DriverUnavailableError
 from drivers.recording import Recording, RecordingWriter
 from drivers.replay import RecordingSource
-from drivers.sensor_package import CaptureRejectedError, SensorPackage
+from drivers.sensor_package import SensorPackage
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import Capture
 

@@ -22,13 +22,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import (
+    CaptureRejectedError,
     DeviceFaultError,
     DeviceLostError,
     DeviceNotFoundError,
     DeviceTimeoutError,
     DriverError,
 )
-from drivers.sensor_package import CaptureRejectedError, SensorPackage, SensorSettings
+from drivers.sensor_package import SensorPackage, SensorSettings
 from surfclass.errors import ConfigurationError
 
 
