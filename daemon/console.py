@@ -1,0 +1,338 @@
+"""A console's copy of a robot's map: equal to it bit for bit, or said to be not."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
+
+import zenoh
+import zenoh.ext
+
+from daemon.transport import Keys, MapMeta, RefusedError, TransportError, direct, fetch, parse_object
+from surfclass.errors import InputError
+from surfclass.types import MapUpdate
+from surfclass.voxel_map import VoxelMap
+from surfclass.wire import Assembler
+
+log = logging.getLogger(__name__)
+
+State = Literal["live", "stale", "resyncing", "disconnected"]
+
+_FETCH = b"fetch"  # a job of the worker; no message is so short
+_RETRY_S = (0.1, 0.2, 0.5, 1.0, 2.0)  # between tries to get a snapshot; the last for ever
+
+
+@dataclass(slots=True)
+class Counters:
+    """What happened to a console since it was made.
+
+    Attributes:
+        deltas: Applied.
+        duplicates: Not applied, being in the map already or of an epoch that is over.
+        gaps: Times that deltas were missing.
+        refused: Messages that were no map update.
+        overflows: Times that messages came faster than they were applied.
+        resyncs: Snapshots taken after the first one.
+    """
+
+    deltas: int = 0
+    duplicates: int = 0
+    gaps: int = 0
+    refused: int = 0
+    overflows: int = 0
+    resyncs: int = 0
+
+
+class MapClient:
+    """Holds a copy of one robot's map; every method may be called from any thread.
+
+    It subscribes, then asks for a snapshot, then applies the deltas with a higher number. A number
+    that is missing, or another epoch, makes it ask again. A lost message is got from the robot's
+    cache first, without a snapshot. It may be made before the robot is there, and outlives the
+    robot's restarts.
+
+    Args:
+        session: An open session; it stays the caller's to close, after this object.
+        robot: The robot's name.
+        stale_after_s: So long nothing may be heard (deltas or the robot's status, which comes once a
+            second) before the state is "stale".
+        timeout_s: What a snapshot may take.
+        waiting: Messages that may wait to be applied; with more, the map is fetched anew.
+
+    Raises:
+        ConfigurationError: If the robot's name cannot be.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        robot: str,
+        *,
+        stale_after_s: float = 5.0,
+        timeout_s: float = 20.0,
+        waiting: int = 1024,
+    ) -> None:
+        self._session, self._keys = session, Keys(robot)
+        self._stale_after_s, self._timeout_s, self._waiting = stale_after_s, timeout_s, waiting
+        # All below is guarded by the condition, but for what is inside `_map`, which guards itself,
+        # and the assembler, which only the worker touches.
+        self._changed = threading.Condition()
+        self._inbox: deque[bytes] = deque()
+        self._robots: set[str] = set()
+        self._status: dict[str, Any] = {}
+        self._told: tuple[Any, Any] = (None, None)
+        self._heard_s = time.monotonic()
+        self._resync, self._fetching = True, False
+        self._closing = False
+        self._map: VoxelMap | None = None
+        self._counters = Counters()
+        self._assembler: Assembler | None = None
+        self._ended: deque[str] = deque(maxlen=64)
+        self._cancel = zenoh.CancellationToken()
+        self._worker = threading.Thread(target=self._run, name=f"map of {robot}", daemon=True)
+        self._delta = zenoh.ext.declare_advanced_subscriber(
+            session,
+            self._keys.delta,
+            direct(self._take_delta),
+            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+        self._misses = self._delta.sample_miss_listener(direct(self._take_miss))
+        self._others: list[Any] = [  # of types that have no more in common than that they end
+            session.declare_subscriber(self._keys.status, direct(self._take_status)),
+            session.liveliness().declare_subscriber(
+                self._keys.alive("*"), direct(self._take_life), history=True
+            ),
+        ]
+        self._worker.start()
+        atexit.register(self.close)  # the worker must not be inside Zenoh when the interpreter goes
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def map(self) -> VoxelMap | None:
+        """The copy, None before the first snapshot; another object after each further one."""
+        return self._map
+
+    @property
+    def state(self) -> State:
+        """Whether `map` is the robot's map.
+
+        "live": it is, up to what is on its way. "stale": it was when the robot was last heard.
+        "resyncing": it is not, and is being fetched. "disconnected": there is no such robot here.
+        """
+        with self._changed:
+            if not self._robots or not self._worker.is_alive():
+                return "disconnected"
+            if self._resync or self._fetching or self._map is None:
+                return "resyncing"
+            return "live" if self.silent_s < self._stale_after_s else "stale"
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since the robot was last heard."""
+        return time.monotonic() - self._heard_s
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """What the robot last said of itself; empty before."""
+        with self._changed:
+            return dict(self._status)
+
+    @property
+    def counters(self) -> Counters:
+        """What happened so far."""
+        with self._changed:
+            return replace(self._counters)
+
+    def wait_until(
+        self,
+        condition: Callable[[VoxelMap], bool] | None = None,
+        *,
+        epoch: str | None = None,
+        sequence: int = 0,
+        timeout_s: float = 10.0,
+    ) -> VoxelMap:
+        """Returns the map once it is synchronised, of that epoch, up to that delta, and `condition` holds.
+
+        Raises:
+            TimeoutError: Saying what state the map is in instead.
+        """
+
+        def there() -> bool:
+            found = self._map
+            return (
+                found is not None
+                and self.state in ("live", "stale")
+                and found.epoch == (epoch or found.epoch)
+                and found.sequence >= sequence
+                and (condition is None or condition(found))
+            )
+
+        with self._changed:
+            if not self._changed.wait_for(there, timeout_s) or self._map is None:
+                at = "no map" if self._map is None else f"map {self._map.epoch:.8} at {self._map.sequence}"
+                raise TimeoutError(f"{self._keys.delta}: {self.state}, {at} after {timeout_s:g} s")
+            return self._map
+
+    def close(self) -> None:
+        """Ends the subscription; `map` stays as it was. Never raises on a session that is closed."""
+        atexit.unregister(self.close)
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._cancel.cancel()
+        if not self._session.is_closed():
+            for declared in [*self._others, self._misses, self._delta]:
+                declared.undeclare()
+        self._worker.join(timeout=5.0)
+
+    # In Zenoh's threads: hand over and return.
+
+    def _take_delta(self, sample: zenoh.Sample) -> None:
+        with self._changed:
+            self._heard_s = time.monotonic()
+            self._inbox.append(sample.payload.to_bytes())
+            if len(self._inbox) > self._waiting:
+                self._inbox.clear()
+                self._counters.overflows += 1
+                self._resync = True
+            self._changed.notify_all()
+
+    def _take_miss(self, miss: zenoh.ext.Miss) -> None:
+        """The robot's cache does not hold what is missing."""
+        with self._changed:
+            self._counters.gaps += 1
+            self._resync = True
+            self._changed.notify_all()
+
+    def _take_status(self, sample: zenoh.Sample) -> None:
+        try:
+            status = parse_object(sample.payload.to_bytes(), str(sample.key_expr))
+        except InputError:
+            with self._changed:
+                self._counters.refused += 1
+            return
+        with self._changed:
+            self._heard_s = time.monotonic()
+            # What the last status told should be here by now. The heartbeat of the deltas' publisher
+            # says the same sooner, but an access list that leaves out its hidden key silences it.
+            if self._is_behind(*self._told):
+                self._counters.gaps += 1
+                self._resync = True
+            self._status, self._told = status, (status.get("epoch"), status.get("sequence"))
+            self._changed.notify_all()
+
+    def _is_behind(self, epoch: object, sequence: object) -> bool:
+        known = self._map
+        if known is None or self._inbox or not isinstance(sequence, int) or epoch in self._ended:
+            return False
+        return epoch != known.epoch or sequence > known.sequence
+
+    def _take_life(self, sample: zenoh.Sample) -> None:
+        who = str(sample.key_expr)
+        with self._changed:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._robots.add(who)
+                self._heard_s = time.monotonic()
+                self._resync = True  # a new run of the robot, or the same after the link was down
+            else:
+                self._robots.discard(who)
+            self._changed.notify_all()
+
+    # In the worker.
+
+    def _run(self) -> None:
+        failures = 0
+        while (job := self._next_job()) is not None:
+            if job != _FETCH:
+                self._apply(job)
+                continue
+            failures = 0 if self._fetch() else failures + 1
+            with self._changed:
+                self._fetching = False
+                self._resync = self._resync or failures > 0
+                self._changed.notify_all()
+                if failures:
+                    pause_s = _RETRY_S[min(failures, len(_RETRY_S)) - 1]
+                    self._changed.wait_for(lambda: self._closing, pause_s)
+
+    def _next_job(self) -> bytes | None:
+        """Waits for a message to apply, or for a need to fetch (`_FETCH`); None is the end."""
+        with self._changed:
+            while not self._closing:
+                if self._resync and self._robots:
+                    self._resync, self._fetching = False, True
+                    return _FETCH
+                if self._assembler is None:
+                    self._inbox.clear()  # from before the first snapshot, which will contain it
+                elif self._inbox:
+                    return self._inbox.popleft()
+                self._changed.wait()
+            return None
+
+    def _apply(self, message: bytes) -> None:
+        assert self._assembler is not None
+        assert self._map is not None
+        known = self._map
+        outcome = "refused"
+        try:
+            update = self._assembler.take(message)
+            if update is None:
+                return
+            if update.epoch in self._ended or (
+                update.epoch == known.epoch and update.sequence <= known.sequence
+            ):
+                outcome = "duplicates"
+            elif update.epoch == known.epoch and update.sequence == known.sequence + 1:
+                known.apply(update)
+                outcome = "deltas"
+            else:
+                outcome = "gaps" if update.epoch == known.epoch else ""
+        except InputError as error:
+            log.warning("%s: %s", self._keys.delta, error)
+        with self._changed:
+            self._changed.notify_all()
+            if outcome:
+                setattr(self._counters, outcome, getattr(self._counters, outcome) + 1)
+            if outcome not in ("deltas", "duplicates"):
+                self._resync = True
+
+    def _fetch(self) -> bool:
+        """Gets the whole map; whether that worked."""
+        try:
+            *_, answer = fetch(self._session, self._keys.meta, timeout_s=self._timeout_s, cancel=self._cancel)
+            meta = MapMeta.parse(answer)
+            assembler, snapshot = Assembler(len(meta.classes.names)), None
+            for part in fetch(
+                self._session, self._keys.snapshot, timeout_s=self._timeout_s, cancel=self._cancel
+            ):
+                snapshot = assembler.take(part) or snapshot
+            if snapshot is None or snapshot.epoch in self._ended:
+                return False
+            fresh = VoxelMap(meta.voxel_size_m, meta.classes, meta.update, epoch=snapshot.epoch)
+            fresh.apply(snapshot)
+        except (TransportError, TimeoutError, RefusedError, InputError) as error:
+            log.info("no map yet: %s", error)
+            return False
+        self._install(fresh, snapshot, len(meta.classes.names))
+        return True
+
+    def _install(self, fresh: VoxelMap, snapshot: MapUpdate, classes: int) -> None:
+        with self._changed:
+            if self._map is not None:
+                self._counters.resyncs += 1
+                if self._map.epoch != snapshot.epoch:
+                    self._ended.append(self._map.epoch)
+            self._map = fresh
+            self._assembler = Assembler(classes)
+            self._heard_s = time.monotonic()
