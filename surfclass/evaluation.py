@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,12 @@ from surfclass.errors import InputError
 from surfclass.frames import Capture
 from surfclass.kinematics import depth_pose
 from surfclass.pipeline import Pipeline
-from surfclass.pooling import Pool, fuse, softmax
+from surfclass.pooling import Pool, fuse
 from surfclass.rig import ColourFeature, Rig
 from surfclass.types import Bool, Float32, Float64, Int32, Observation
 from surfclass.viewing import view_surface
-from surfclass.voxel_map import MapLayers, VoxelMap, voxel_of
+from surfclass.voxel_index import Keys, pack, unpack, voxel_of
+from surfclass.voxel_map import MapLayers
 
 SCHEMA = 1
 CALIBRATION_BINS = 15
@@ -56,7 +57,7 @@ class Score:
         """As `evaluate --json` writes it; a figure that does not exist (no sample) is null."""
         figures = {name: getattr(self, name) for name in ("overall", "balanced", "ece", "nll", "rejected")}
         return {
-            **{name: None if np.isnan(value) else float(value) for name, value in figures.items()},
+            **{name: _figure(value) for name, value in figures.items()},
             "voxels": self.voxels,
             "confusion": self.confusion.tolist(),
         }
@@ -73,23 +74,39 @@ def score(truth: NDArray[np.intp], probability: NDArray[Any], classified: Bool) 
     n, k = probability.shape
     result = probability.argmax(axis=1)
     right = (result == truth) & classified
-    confusion = np.zeros((k, k), np.int64)
-    np.add.at(confusion, (truth[classified], result[classified]), 1)
-    total = np.bincount(truth, minlength=k)
-    present = total > 0
-    recall = np.bincount(truth[right], minlength=k)[present] / total[present]
+    overall, balanced, confusion = accuracy(truth, result, classified, k)
     chosen = probability[classified].astype(np.float64)
     confidence = chosen.max(axis=1) if len(chosen) else np.zeros(0)
     of_truth = chosen[np.arange(len(chosen)), truth[classified]]
     return Score(
-        overall=float(right.mean()) if n else np.nan,
-        balanced=float(recall.mean()) if n else np.nan,
+        overall=overall,
+        balanced=balanced,
         ece=calibration_error(confidence, right[classified]),
         nll=float(-np.log(np.maximum(of_truth, 1e-12)).mean()) if len(chosen) else np.nan,
         rejected=float(1 - classified.mean()) if n else np.nan,
         voxels=n,
         confusion=confusion,
     )
+
+
+def accuracy(
+    truth: NDArray[np.intp], result: NDArray[np.intp], classified: Bool, k: int
+) -> tuple[float, float, NDArray[np.int64]]:
+    """Returns overall and balanced accuracy and the confusion matrix, as `Score` has them.
+
+    Args:
+        truth: (n,) true classes, 0…k-1.
+        result: (n,) classes found; not looked at where not `classified`.
+        classified: (n,) bool.
+        k: Number of classes.
+    """
+    confusion = np.bincount(truth[classified] * k + result[classified], minlength=k * k).reshape(k, k)
+    total = np.bincount(truth, minlength=k)
+    present = total > 0
+    if not present.any():
+        return np.nan, np.nan, confusion
+    right = np.diag(confusion)
+    return float(right.sum() / total.sum()), float((right[present] / total[present]).mean()), confusion
 
 
 def calibration_error(confidence: Float64, right: Bool) -> float:
@@ -108,37 +125,30 @@ class Benchmark:
     """The benchmark map: every labelled pixel's surface point votes for its voxel's class."""
 
     def __init__(self, voxel_size_m: float, class_count: int) -> None:
-        self._size = voxel_size_m
-        self._votes: dict[tuple[int, int, int], NDArray[np.int64]] = {}
-        self._classes = class_count
+        self._size, self._classes = voxel_size_m, class_count
+        self._key = np.zeros(0, np.int64)
+        self._votes = np.zeros((0, class_count), np.int64)
 
     def add(self, point_base: Float32, label: NDArray[np.uint8]) -> None:
         """Adds (n, 3) points in `base`, m, with their labels, 1…k."""
-        voxels, which = np.unique(voxel_of(point_base, self._size), axis=0, return_inverse=True)
-        key = which.reshape(-1) * self._classes + (label.astype(np.intp) - 1)
-        counts = np.bincount(key, minlength=len(voxels) * self._classes).reshape(-1, self._classes)
-        for voxel, count in zip(map(tuple, voxels.tolist()), counts, strict=True):
-            if voxel in self._votes:
-                self._votes[voxel] += count
-            else:
-                self._votes[voxel] = count
+        key, voxel = np.unique(pack(voxel_of(point_base, self._size)), return_inverse=True)
+        flat = voxel.reshape(-1) * self._classes + (label.astype(np.intp) - 1)
+        votes = np.bincount(flat, minlength=len(key) * self._classes)
+        self._join(key, votes.reshape(-1, self._classes))
+
+    def merge(self, other: Benchmark) -> None:
+        """Adds another benchmark's votes."""
+        self._join(other._key, other._votes)
+
+    def _join(self, key: Keys, votes: NDArray[np.int64]) -> None:
+        joined, row = np.unique(np.concatenate([self._key, key]), return_inverse=True)
+        total = np.zeros((len(joined), self._classes), np.int64)
+        np.add.at(total, row.reshape(-1), np.concatenate([self._votes, votes]))
+        self._key, self._votes = joined, total
 
     def truth(self) -> tuple[Int32, NDArray[np.intp]]:
         """Returns the voxels (n, 3), sorted, and the class that most of their pixels have (n,)."""
-        if not self._votes:
-            return np.zeros((0, 3), np.int32), np.zeros(0, np.intp)
-        voxels = sorted(self._votes)
-        counts = np.array([self._votes[voxel] for voxel in voxels])
-        return np.array(voxels, np.int32), counts.argmax(axis=1)
-
-
-@dataclass(slots=True)
-class _RouteMaps:
-    """The maps of one route: all test captures fused."""
-
-    fused: VoxelMap
-    views: dict[str, Score] = field(default_factory=dict)
-    pixels: dict[str, Score] = field(default_factory=dict)
+        return unpack(self._key), self._votes.argmax(axis=1)
 
 
 def evaluate(
@@ -159,54 +169,52 @@ def evaluate(
         InputError: If no capture has a label.
         ConfigurationError: If the model has not the colour feature of a route.
     """
-    routes = list(routes)
-    main = pipeline.rig.features.colour
+    main, pool = pipeline.rig.features.colour, pipeline.settings.pool
     feature_of = {route: ROUTES[route] or main for route in routes}
+    features = tuple(dict.fromkeys(feature_of.values()))
     k = len(pipeline.model.classes.names)
-    maps = {route: _RouteMaps(pipeline.new_map()) for route in routes}
     benchmark = Benchmark(pipeline.rig.voxel_size_m, k)
+    fused = {feature: pipeline.new_map() for feature in features}
+    views: dict[str, dict[str, Score]] = {route: {} for route in feature_of}
+    pixels: dict[str, dict[str, Any]] = {route: {} for route in feature_of}
     for capture in captures:
         of_pixel = _label(capture)
         progress(capture.name)
-        classified = pipeline.classify(capture, tuple(dict.fromkeys(feature_of.values())))
+        classified = pipeline.classify(capture, features)
         label = of_pixel[classified.view.has_point]  # in the order of an observation's points
         labelled = label > 0
+        truth_of_pixel = label[labelled].astype(np.intp) - 1
         of_view = Benchmark(pipeline.rig.voxel_size_m, k)
-        for route, feature in feature_of.items():
+        for feature in features:
             observation = pipeline.observe(classified, feature)
-            if route == routes[0]:
-                for truth_map in (benchmark, of_view):
-                    truth_map.add(observation.point_base[labelled], label[labelled])
-            maps[route].fused.add(observation, capture.t_ns)
+            said = observation.of(labelled)
+            if feature == features[0]:
+                of_view.add(said.point_base, label[labelled])
+                benchmark.merge(of_view)
+            fused[feature].add(observation, capture.t_ns)
             view_map = pipeline.new_map()
             view_map.add(observation, capture.t_ns)
             index, truth = of_view.truth()
-            layers = view_map.at(index, pipeline.settings.pool)
-            maps[route].views[capture.name] = score_layers(layers, route, truth)
-            maps[route].pixels[capture.name] = _score_pixels(
-                observation.of(labelled), label[labelled].astype(np.intp) - 1, route, pipeline.settings.pool
-            )
-    if not any(route_maps.views for route_maps in maps.values()):
-        raise InputError("there is no capture of role 'test' to evaluate")
+            layers = view_map.at(index, pool)
+            for route in (route for route in feature_of if feature_of[route] == feature):
+                views[route][capture.name] = score_layers(layers, route, truth)
+                pixels[route][capture.name] = _score_pixels(said, truth_of_pixel, route, pool)
     index, truth = benchmark.truth()
+    if not len(index):
+        raise InputError("there is no capture of role 'test' with a labelled surface point to evaluate")
+    layers_of = {feature: fused[feature].at(index, pool) for feature in features}
     return {
         "schema": SCHEMA,
         "classes": list(pipeline.model.classes.names),
         "routes": {
             route: {
-                "fused": score_layers(found.fused.at(index, pipeline.settings.pool), route, truth).to_json(),
-                "views": {name: of_view.to_json() for name, of_view in found.views.items()},
-                "pixels": {name: _without_voxels(of_view) for name, of_view in found.pixels.items()},
+                "fused": score_layers(layers_of[feature], route, truth).to_json(),
+                "views": {name: found.to_json() for name, found in views[route].items()},
+                "pixels": pixels[route],
             }
-            for route, found in maps.items()
+            for route, feature in feature_of.items()
         },
     }
-
-
-def _without_voxels(found: Score) -> dict[str, Any]:
-    figures = found.to_json()
-    figures["pixels"] = figures.pop("voxels")
-    return figures
 
 
 def benchmark_of(
@@ -254,12 +262,29 @@ def score_layers(layers: MapLayers, route: str, truth: NDArray[np.intp]) -> Scor
     return score(truth, p, p.max(axis=1) > 1 / p.shape[1] + 1e-6)
 
 
-def _score_pixels(observation: Observation, truth: NDArray[np.intp], route: str, pool: Pool) -> Score:
+def _score_pixels(
+    observation: Observation, truth: NDArray[np.intp], route: str, pool: Pool
+) -> dict[str, Any]:
     """Scores labelled pixels as if each were a voxel that only this capture saw."""
     has_colour, has_texture = observation.has_colour, observation.has_texture
     if route == "texture":
-        return score(truth, softmax(observation.texture), has_texture)
-    if route != "combined":
-        return score(truth, softmax(observation.colour), has_colour)
-    both = fuse(observation.colour, observation.texture, has_colour, has_texture, observation.weight, pool)
-    return score(truth, both, has_colour | has_texture)
+        evidence, classified = observation.texture, has_texture
+    elif route == "combined":
+        classified = has_colour | has_texture
+        evidence = fuse(
+            observation.colour, observation.texture, has_colour, has_texture, observation.weight, pool
+        )
+    else:
+        evidence, classified = observation.colour, has_colour
+    overall, balanced, confusion = accuracy(truth, evidence.argmax(axis=1), classified, evidence.shape[1])
+    return {
+        "overall": _figure(overall),
+        "balanced": _figure(balanced),
+        "rejected": _figure(float(1 - classified.mean()) if len(truth) else np.nan),
+        "pixels": len(truth),
+        "confusion": confusion.tolist(),
+    }
+
+
+def _figure(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
