@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import atexit
+import json
 import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from typing import Any, Literal, Self
 
 import zenoh
-import zenoh.ext
 
 from daemon.transport import Keys, MapMeta, RefusedError, TransportError, direct, fetch, parse_object
 from surfclass.errors import InputError
@@ -24,8 +25,16 @@ log = logging.getLogger(__name__)
 
 State = Literal["live", "stale", "resyncing", "disconnected"]
 
-_FETCH = b"fetch"  # a job of the worker; no message is so short
 _RETRY_S = (0.1, 0.2, 0.5, 1.0, 2.0)  # between tries to get a snapshot; the last for ever
+
+
+class _Job(Enum):
+    """What the worker does next: it reads what came, or fetches what did not."""
+
+    DELTA = auto()
+    BEAT = auto()
+    FETCH_MISSED = auto()
+    FETCH_ALL = auto()
 
 
 @dataclass(slots=True)
@@ -36,6 +45,7 @@ class Counters:
         deltas: Applied.
         duplicates: Not applied, being in the map already or of an epoch that is over.
         gaps: Times that deltas were missing.
+        recovered: Of the applied ones, those that had to be asked for.
         refused: Messages that were no map update.
         overflows: Times that messages came faster than they were applied.
         resyncs: Snapshots taken after the first one.
@@ -44,6 +54,7 @@ class Counters:
     deltas: int = 0
     duplicates: int = 0
     gaps: int = 0
+    recovered: int = 0
     refused: int = 0
     overflows: int = 0
     resyncs: int = 0
@@ -53,17 +64,17 @@ class MapClient:
     """Holds a copy of one robot's map; every method may be called from any thread.
 
     It subscribes, then asks for a snapshot, then applies the deltas with a higher number. A number
-    that is missing, or another epoch, makes it ask again. A lost message is got from the robot's
-    cache first, without a snapshot. It may be made before the robot is there, and outlives the
-    robot's restarts.
+    that is missing, in a delta or in the robot's beat, makes it ask for what it missed, and if the
+    robot has that no more, or has begun another epoch, for a snapshot again. It may be made before
+    the robot is there, and outlives the robot's restarts.
 
     Args:
         session: An open session; it stays the caller's to close, after this object.
         robot: The robot's name.
-        stale_after_s: So long nothing may be heard (deltas or the robot's status, which comes once a
+        stale_after_s: So long nothing may be heard (not even the beat, which comes some times a
             second) before the state is "stale".
         timeout_s: What a snapshot may take.
-        waiting: Messages that may wait to be applied; with more, the map is fetched anew.
+        waiting: Messages that may wait to be applied; with more, they are dropped and asked for again.
 
     Raises:
         ConfigurationError: If the robot's name cannot be.
@@ -83,27 +94,22 @@ class MapClient:
         # All below is guarded by the condition, but for what is inside `_map`, which guards itself,
         # and the assembler, which only the worker touches.
         self._changed = threading.Condition()
-        self._inbox: deque[bytes] = deque()
+        self._inbox: deque[tuple[_Job, bytes]] = deque()
         self._robots: set[str] = set()
         self._status: dict[str, Any] = {}
-        self._told: tuple[Any, Any] = (None, None)
         self._heard_s = time.monotonic()
-        self._resync, self._fetching = True, False
+        self._need: _Job | None = _Job.FETCH_ALL
+        self._fetching = False
         self._closing = False
         self._map: VoxelMap | None = None
         self._counters = Counters()
-        self._assembler: Assembler | None = None
+        self._assembler = Assembler(0)  # of no use before the first snapshot
         self._ended: deque[str] = deque(maxlen=64)
         self._cancel = zenoh.CancellationToken()
         self._worker = threading.Thread(target=self._run, name=f"map of {robot}", daemon=True)
-        self._delta = zenoh.ext.declare_advanced_subscriber(
-            session,
-            self._keys.delta,
-            direct(self._take_delta),
-            recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
-        self._misses = self._delta.sample_miss_listener(direct(self._take_miss))
-        self._others: list[Any] = [  # of types that have no more in common than that they end
+        self._declared: list[Any] = [
+            session.declare_subscriber(self._keys.delta, direct(self._take_delta)),
+            session.declare_subscriber(self._keys.beat, direct(self._take_beat)),
             session.declare_subscriber(self._keys.status, direct(self._take_status)),
             session.liveliness().declare_subscriber(
                 self._keys.alive("*"), direct(self._take_life), history=True
@@ -133,7 +139,7 @@ class MapClient:
         with self._changed:
             if not self._robots or not self._worker.is_alive():
                 return "disconnected"
-            if self._resync or self._fetching or self._map is None:
+            if self._need or self._fetching or self._map is None:
                 return "resyncing"
             return "live" if self.silent_s < self._stale_after_s else "stale"
 
@@ -192,27 +198,26 @@ class MapClient:
             self._changed.notify_all()
         self._cancel.cancel()
         if not self._session.is_closed():
-            for declared in [*self._others, self._misses, self._delta]:
+            for declared in self._declared:
                 declared.undeclare()
         self._worker.join(timeout=5.0)
 
     # In Zenoh's threads: hand over and return.
 
     def _take_delta(self, sample: zenoh.Sample) -> None:
+        self._take(_Job.DELTA, sample)
+
+    def _take_beat(self, sample: zenoh.Sample) -> None:
+        self._take(_Job.BEAT, sample)
+
+    def _take(self, kind: _Job, sample: zenoh.Sample) -> None:
         with self._changed:
             self._heard_s = time.monotonic()
-            self._inbox.append(sample.payload.to_bytes())
+            self._inbox.append((kind, sample.payload.to_bytes()))
             if len(self._inbox) > self._waiting:
                 self._inbox.clear()
                 self._counters.overflows += 1
-                self._resync = True
-            self._changed.notify_all()
-
-    def _take_miss(self, miss: zenoh.ext.Miss) -> None:
-        """The robot's cache does not hold what is missing."""
-        with self._changed:
-            self._counters.gaps += 1
-            self._resync = True
+                self._need = self._need or _Job.FETCH_MISSED
             self._changed.notify_all()
 
     def _take_status(self, sample: zenoh.Sample) -> None:
@@ -224,19 +229,8 @@ class MapClient:
             return
         with self._changed:
             self._heard_s = time.monotonic()
-            # What the last status told should be here by now. The heartbeat of the deltas' publisher
-            # says the same sooner, but an access list that leaves out its hidden key silences it.
-            if self._is_behind(*self._told):
-                self._counters.gaps += 1
-                self._resync = True
-            self._status, self._told = status, (status.get("epoch"), status.get("sequence"))
+            self._status = status
             self._changed.notify_all()
-
-    def _is_behind(self, epoch: object, sequence: object) -> bool:
-        known = self._map
-        if known is None or self._inbox or not isinstance(sequence, int) or epoch in self._ended:
-            return False
-        return epoch != known.epoch or sequence > known.sequence
 
     def _take_life(self, sample: zenoh.Sample) -> None:
         who = str(sample.key_expr)
@@ -244,7 +238,8 @@ class MapClient:
             if sample.kind == zenoh.SampleKind.PUT:
                 self._robots.add(who)
                 self._heard_s = time.monotonic()
-                self._resync = True  # a new run of the robot, or the same after the link was down
+                # A new run of the robot, or the same after the link was down.
+                self._need = self._need or _Job.FETCH_MISSED
             else:
                 self._robots.discard(who)
             self._changed.notify_all()
@@ -254,68 +249,101 @@ class MapClient:
     def _run(self) -> None:
         failures = 0
         while (job := self._next_job()) is not None:
-            if job != _FETCH:
-                self._apply(job)
+            kind, message = job
+            if kind in (_Job.DELTA, _Job.BEAT):
+                self._read(kind, message)
                 continue
-            failures = 0 if self._fetch() else failures + 1
+            fetched = self._fetch_missed() if kind is _Job.FETCH_MISSED else self._fetch_all()
+            failures = 0 if fetched or kind is _Job.FETCH_MISSED else failures + 1
             with self._changed:
                 self._fetching = False
-                self._resync = self._resync or failures > 0
+                self._need = self._need if fetched else _Job.FETCH_ALL
                 self._changed.notify_all()
                 if failures:
                     pause_s = _RETRY_S[min(failures, len(_RETRY_S)) - 1]
                     self._changed.wait_for(lambda: self._closing, pause_s)
 
-    def _next_job(self) -> bytes | None:
-        """Waits for a message to apply, or for a need to fetch (`_FETCH`); None is the end."""
+    def _next_job(self) -> tuple[_Job, bytes] | None:
+        """Waits for something to do; None is the end."""
         with self._changed:
             while not self._closing:
-                if self._resync and self._robots:
-                    self._resync, self._fetching = False, True
-                    return _FETCH
-                if self._assembler is None:
+                if self._need is not None and self._robots:
+                    need, self._need, self._fetching = self._need, None, True
+                    return need if self._map is not None else _Job.FETCH_ALL, b""
+                if self._map is None:
                     self._inbox.clear()  # from before the first snapshot, which will contain it
                 elif self._inbox:
                     return self._inbox.popleft()
                 self._changed.wait()
             return None
 
-    def _apply(self, message: bytes) -> None:
-        assert self._assembler is not None
-        assert self._map is not None
+    def _read(self, kind: _Job, message: bytes) -> None:
+        """Applies a delta if it is the next one, and sees from a delta or a beat whether one is missing."""
         known = self._map
-        outcome = "refused"
+        assert known is not None
         try:
-            update = self._assembler.take(message)
-            if update is None:
-                return
-            if update.epoch in self._ended or (
-                update.epoch == known.epoch and update.sequence <= known.sequence
-            ):
-                outcome = "duplicates"
-            elif update.epoch == known.epoch and update.sequence == known.sequence + 1:
-                known.apply(update)
-                outcome = "deltas"
+            if kind is _Job.DELTA:
+                update = self._assembler.take(message)
+                if update is None or self._apply(known, update):
+                    return
+                epoch, sequence = update.epoch, update.sequence
             else:
-                outcome = "gaps" if update.epoch == known.epoch else ""
-        except InputError as error:
-            log.warning("%s: %s", self._keys.delta, error)
+                beat = parse_object(message, self._keys.beat)
+                epoch, sequence = str(beat.get("epoch")), int(beat.get("sequence", 0))
+        except (InputError, TypeError, ValueError) as error:
+            log.warning("%s: %s", self._keys.robot, error)
+            with self._changed:
+                self._counters.refused += 1
+                self._need = self._need or _Job.FETCH_MISSED
+                self._changed.notify_all()
+            return
         with self._changed:
+            if epoch in self._ended or (epoch == known.epoch and sequence <= known.sequence):
+                self._counters.duplicates += kind is _Job.DELTA
+            elif epoch != known.epoch:
+                self._need = _Job.FETCH_ALL
+            else:
+                self._counters.gaps += 1
+                self._need = self._need or _Job.FETCH_MISSED
             self._changed.notify_all()
-            if outcome:
-                setattr(self._counters, outcome, getattr(self._counters, outcome) + 1)
-            if outcome not in ("deltas", "duplicates"):
-                self._resync = True
 
-    def _fetch(self) -> bool:
+    def _apply(self, known: VoxelMap, update: MapUpdate) -> bool:
+        """Applies a delta if it is the very next one; whether it was."""
+        if update.epoch != known.epoch or update.sequence != known.sequence + 1:
+            return False
+        known.apply(update)
+        with self._changed:
+            self._counters.deltas += 1
+            self._changed.notify_all()
+        return True
+
+    def _fetch_missed(self) -> bool:
+        """Gets the deltas that are missing, if any; whether the robot has them."""
+        known = self._map
+        assert known is not None
+        question = json.dumps({"epoch": known.epoch, "after": known.sequence}).encode()
+        assembler = Assembler(len(known.classes.names))
+        try:
+            for part in self._ask(self._keys.missed, question):
+                update = assembler.take(part)
+                if update is not None and self._apply(known, update):
+                    with self._changed:
+                        self._counters.recovered += 1
+        except (TransportError, TimeoutError, RefusedError, InputError) as error:
+            log.info("what is missing cannot be had: %s", error)
+            return False
+        return True
+
+    def _ask(self, key: str, payload: bytes | None = None) -> Iterator[bytes]:
+        return fetch(self._session, key, payload, timeout_s=self._timeout_s, cancel=self._cancel)
+
+    def _fetch_all(self) -> bool:
         """Gets the whole map; whether that worked."""
         try:
-            *_, answer = fetch(self._session, self._keys.meta, timeout_s=self._timeout_s, cancel=self._cancel)
+            *_, answer = self._ask(self._keys.meta)
             meta = MapMeta.parse(answer)
             assembler, snapshot = Assembler(len(meta.classes.names)), None
-            for part in fetch(
-                self._session, self._keys.snapshot, timeout_s=self._timeout_s, cancel=self._cancel
-            ):
+            for part in self._ask(self._keys.snapshot):
                 snapshot = assembler.take(part) or snapshot
             if snapshot is None or snapshot.epoch in self._ended:
                 return False
@@ -324,14 +352,14 @@ class MapClient:
         except (TransportError, TimeoutError, RefusedError, InputError) as error:
             log.info("no map yet: %s", error)
             return False
-        self._install(fresh, snapshot, len(meta.classes.names))
+        self._install(fresh, len(meta.classes.names))
         return True
 
-    def _install(self, fresh: VoxelMap, snapshot: MapUpdate, classes: int) -> None:
+    def _install(self, fresh: VoxelMap, classes: int) -> None:
         with self._changed:
             if self._map is not None:
                 self._counters.resyncs += 1
-                if self._map.epoch != snapshot.epoch:
+                if self._map.epoch != fresh.epoch:
                     self._ended.append(self._map.epoch)
             self._map = fresh
             self._assembler = Assembler(classes)

@@ -7,11 +7,11 @@ import json
 import logging
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import zenoh
-import zenoh.ext
 
 from daemon.requests import CommandError
 from daemon.transport import Keys, MapMeta, direct, parse_object
@@ -21,8 +21,8 @@ from surfclass.wire import ENCODING, encode_parts
 
 log = logging.getLogger(__name__)
 
-_CACHED_MESSAGES = 256  # 16 MB: what a console can have missed and still get without a snapshot
-_HEARTBEAT_S = 0.2  # so late at most a console learns that the last message was lost
+_KEPT_MESSAGES = 256  # 16 MB: what a console can have missed and still get without a snapshot
+_BEAT_S = 0.25  # so late at most a console learns that the last delta was lost
 _WAITING_QUERIES = 16
 
 Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
@@ -31,11 +31,15 @@ Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
 class MapPublisher:
     """Publishes one robot's map; every method may be called from any thread.
 
-    What a console needs in order to hold the same map is kept by three rules. Deltas go out in the
+    What a console needs in order to hold the same map is kept by four rules. Deltas go out in the
     order of their numbers, all parts of a delta under its one number. A snapshot taken at number s
     contains the deltas up to s, whole, since the map takes both under its own lock; so a console
-    applies to it exactly what has a higher number. And a delta is put without ever waiting for a slow
-    console: what one misses it sees by the number, and asks again.
+    applies to it exactly what has a higher number. A beat tells the number of the last delta, behind
+    it in the same queue; so who hears the beat and has not the delta has lost it. And a delta is put
+    without ever waiting for a slow console: what one misses it asks for.
+
+    (Zenoh's own advanced publisher has a cache and a heartbeat too, but answers from that cache in
+    the threads that receive, under a lock that its `put` needs: one slow console then stalls both.)
 
     Args:
         session: An open session; it stays the caller's to close.
@@ -59,25 +63,34 @@ class MapPublisher:
         meta = MapMeta.parse(map_meta).model_dump_json().encode()
         self._snapshot = snapshot
         self._lock = threading.Lock()
-        self._last = ("", -1)
-        self._delta = zenoh.ext.declare_advanced_publisher(
-            session,
-            keys.delta,
-            encoding=ENCODING,
-            # Any other choice lets one frozen console stall the capture loop, for 5 s measured.
-            congestion_control=zenoh.CongestionControl.DROP,
-            cache=zenoh.ext.CacheConfig(max_samples=_CACHED_MESSAGES),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(
-                heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S
-            ),
+        now = snapshot()
+        self._last = (now.epoch, now.sequence)
+        self._kept: deque[tuple[int, list[bytes]]] = deque()  # of the last epoch
+        self._delta, self._beat = (
+            session.declare_publisher(
+                key,
+                encoding=encoding,
+                # Any other choice lets one frozen console stall the capture loop, for 5 s measured.
+                congestion_control=zenoh.CongestionControl.DROP,
+                # Not that of the replies: one that waits for a frozen console holds up its priority.
+                priority=zenoh.Priority.DATA_HIGH,
+            )
+            for key, encoding in ((keys.delta, ENCODING), (keys.beat, "application/json"))
         )
         self._status = session.declare_publisher(
-            keys.status, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP
+            keys.status,
+            encoding="application/json",
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_HIGH,
         )
         self._answering = [
             _Answering(session, keys.meta, lambda query: query.reply(keys.meta, meta)),
-            _Answering(session, keys.snapshot, self._reply_snapshot),
+            _Answering(session, keys.snapshot, self._reply_snapshot, threads=4),
+            _Answering(session, keys.missed, self._reply_missed, threads=4),
         ]
+        self._closing = threading.Event()
+        self._beating = threading.Thread(target=self._beat_on, name=f"beat of {robot}", daemon=True)
+        self._beating.start()
         # Last, so that who sees the robot alive finds everything else in place.
         self._alive = session.liveliness().declare_token(keys.alive(str(session.zid())))
         atexit.register(self.close)  # no thread may be inside Zenoh when the interpreter goes
@@ -99,16 +112,18 @@ class MapPublisher:
             epoch, sequence = self._last
             if update.epoch == epoch and update.sequence <= sequence:
                 raise ValueError(f"map update {update.sequence} after {sequence}: deltas go out in order")
+            if update.epoch != epoch:
+                self._kept.clear()
             self._last = (update.epoch, update.sequence)
+            self._kept.append((update.sequence, parts))
+            while sum(len(kept) for _, kept in self._kept) > _KEPT_MESSAGES:
+                self._kept.popleft()
             for part in parts:
                 self._delta.put(part)
 
     def publish_status(self, status: Mapping[str, Any]) -> None:
-        """Sends how the robot is, with the epoch and number of the last delta sent; once a second or so."""
-        with self._lock:
-            epoch, sequence = self._last
-        known = {"epoch": epoch, "sequence": sequence} if epoch else {}
-        self._status.put(json.dumps({**status, **known}))
+        """Sends how the robot is; once a second or so."""
+        self._status.put(json.dumps(dict(status)))
 
     def serve(self, command: str, handler: Handler) -> None:
         """Answers a command from now on, one at a time, in a thread of its own.
@@ -129,27 +144,58 @@ class MapPublisher:
         for part in encode_parts(self._snapshot()):
             query.reply(self._keys.snapshot, part, encoding=ENCODING)
 
+    def _reply_missed(self, query: zenoh.Query) -> None:
+        """Replies with the deltas of an epoch after a number, if all are kept; with the last one at least."""
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        asked = parse_object(payload, self._keys.missed)
+        after = asked.get("after")
+        with self._lock:
+            epoch, last = self._last
+            kept = dict(self._kept)
+        wanted = range(min(after + 1, last), last + 1) if isinstance(after, int) else range(0)
+        if asked.get("epoch") != epoch or not wanted or not kept.keys() >= set(wanted):
+            raise CommandError(f"{asked}: not all of that is kept; ask for a snapshot")
+        for number in wanted:
+            for part in kept[number]:
+                query.reply(self._keys.missed, part, encoding=ENCODING)
+
+    def _beat_on(self) -> None:
+        while not self._closing.wait(_BEAT_S):
+            with self._lock:
+                epoch, sequence = self._last
+                self._beat.put(json.dumps({"epoch": epoch, "sequence": sequence}))
+
     def close(self) -> None:
         """Withdraws everything; the map and the session stay. Never raises on a session that is closed."""
         atexit.unregister(self.close)
+        self._closing.set()
+        self._beating.join(timeout=5.0)
         if not self._session.is_closed():
             self._alive.undeclare()
         for answering in self._answering:
             answering.close()
         if not self._session.is_closed():
-            self._delta.undeclare()
-            self._status.undeclare()
+            for declared in (self._delta, self._beat, self._status):
+                declared.undeclare()
 
 
 class _Answering:
-    """A queryable whose queries are answered in order by a thread of its own; none is left unanswered."""
+    """A queryable whose queries are answered by threads of its own; none is left unanswered.
 
-    def __init__(self, session: zenoh.Session, key: str, answer: Callable[[zenoh.Query], None]) -> None:
+    With more than one thread, one that waits for a frozen console does not keep the next one waiting.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, key: str, answer: Callable[[zenoh.Query], None], threads: int = 1
+    ) -> None:
         self._session = session
         self._answer = answer
         self._waiting: queue.Queue[zenoh.Query | None] = queue.Queue(_WAITING_QUERIES)
-        self._thread = threading.Thread(target=self._run, name=f"answers {key}", daemon=True)
-        self._thread.start()
+        self._threads = [
+            threading.Thread(target=self._run, name=f"answers {key}", daemon=True) for _ in range(threads)
+        ]
+        for thread in self._threads:
+            thread.start()
         self._queryable = session.declare_queryable(key, direct(self._take))
 
     def _take(self, query: zenoh.Query) -> None:
@@ -177,13 +223,16 @@ class _Answering:
             self._queryable.undeclare()
         while True:
             try:
-                self._waiting.put_nowait(None)
+                query = self._waiting.get_nowait()
+            except queue.Empty:
                 break
-            except queue.Full:
-                query = self._waiting.get()
-                if query is not None:
-                    _refuse(query, "Stopping", "the robot is stopping")
-        self._thread.join(timeout=5.0)
+            if query is not None:
+                _refuse(query, "Stopping", "the robot is stopping")
+                query.drop()
+        for _ in self._threads:
+            self._waiting.put(None)
+        for thread in self._threads:
+            thread.join(timeout=5.0)
 
 
 def _refuse(query: zenoh.Query, kind: str, message: str) -> None:

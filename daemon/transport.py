@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import json
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,8 +34,12 @@ _SETTINGS: dict[str, Any] = {
     "scouting/gossip/enabled": False,
     "scouting/delay": 0,
     "transport/shared_memory/enabled": False,
-    "transport/link/tx/queue/size/data": 16,
+    "transport/link/tx/queue/size/data_high": 16,
 }
+
+# Zenoh has one thread that sends, and one link that is closed while a reply waits in its queue stops
+# that thread, and with it all other links, for up to 5 s. Zenoh reads this variable once.
+_RUNTIME = "(tx: (worker_threads: 4), net: (worker_threads: 4))"
 
 _open_sessions: list[zenoh.Session] = []
 
@@ -72,6 +77,16 @@ class Keys:
     def delta(self) -> str:
         """Published: `surfclass.v1.MapUpdate`, in parts."""
         return self._key("map/delta")
+
+    @property
+    def beat(self) -> str:
+        """Published: `{"epoch", "sequence"}` of the last delta, as JSON, some times a second."""
+        return self._key("map/beat")
+
+    @property
+    def missed(self) -> str:
+        """Query with `{"epoch", "after"}`: the deltas after that number, or an error if not all are kept."""
+        return self._key("map/missed")
 
     @property
     def snapshot(self) -> str:
@@ -151,6 +166,7 @@ def open_session(
                 f"zenoh: {endpoint}: a socket's path may have {_SOCKET_PATH_BYTES} bytes, "
                 f"this has {len(path.encode())}"
             )
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     configuration = zenoh.Config()
     wanted = {"mode": mode, "listen/endpoints": list(listen), "connect/endpoints": list(connect)}
     for key, value in {**wanted, **_SETTINGS, **(settings or {})}.items():
@@ -205,7 +221,9 @@ def fetch(
             payload=payload,
             timeout=timeout_s,
             cancellation_token=cancel,
-            congestion_control=zenoh.CongestionControl.BLOCK,  # replies are sent as the query was
+            # Replies are sent as the query was: none is dropped, and they make way for the live map.
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_LOW,
             # Else all replies but the last are taken for outdated, as they have one key.
             consolidation=zenoh.ConsolidationMode.NONE,
         )

@@ -197,13 +197,15 @@ def test_a_robot_that_clears_its_map_says_so_by_a_new_epoch(robot: Robot, consol
     assert len(client.wait_until()) == 0
 
 
-def test_lost_deltas_are_got_from_the_robots_cache(robot: Robot, console) -> None:
+def test_lost_deltas_are_asked_for_without_a_snapshot(robot: Robot, console) -> None:
     client = console(LOSES_DELTAS)
     client.wait_until()
     for number in range(60):
         robot.frame(5 if number % 6 < 5 else 300)  # each sixth is lost on the way, the last too
     counters = converged(client, robot).counters
-    assert (counters.deltas, counters.gaps, counters.resyncs) == (60, 0, 0)
+    assert (counters.deltas, counters.resyncs) == (60, 0)
+    assert counters.gaps >= 1
+    assert counters.recovered >= 10
 
 
 def test_the_last_delta_is_not_missed_though_nothing_follows_it(robot: Robot, console) -> None:
@@ -212,27 +214,23 @@ def test_the_last_delta_is_not_missed_though_nothing_follows_it(robot: Robot, co
     robot.frame(5)
     client.wait_until(sequence=1)
     robot.frame(300)
-    converged(client, robot)
+    assert converged(client, robot).counters.recovered == 1
 
 
-def test_more_losses_than_the_cache_holds_lead_to_a_snapshot(endpoint: str, console, monkeypatch) -> None:
-    monkeypatch.setattr("daemon.publisher._CACHED_MESSAGES", 2)
+def test_more_losses_than_are_kept_lead_to_a_snapshot(endpoint: str, console, monkeypatch) -> None:
+    monkeypatch.setattr("daemon.publisher._KEPT_MESSAGES", 2)
     with Robot(endpoint) as robot:
         client = console(LOSES_DELTAS)
         client.wait_until()
-        robot.frame(5)
         for _ in range(40):
             robot.frame(300)
-        robot.frame(5)
         counters = converged(client, robot).counters
         assert counters.gaps >= 1
         assert counters.resyncs >= 1
 
 
-def test_an_access_list_that_forgets_the_hidden_keys_costs_snapshots_but_no_truth(
-    endpoint: str, console
-) -> None:
-    """`**` matches no chunk with @, under which recovery and heartbeat live: the status tells instead."""
+def test_an_access_list_of_the_robots_keys_lets_all_of_this_through(endpoint: str, console) -> None:
+    """Nothing here lives under hidden keys, which `**` does not match and such a list would silence."""
     allowed = [
         "put",
         "declare_subscriber",
@@ -252,52 +250,65 @@ def test_an_access_list_that_forgets_the_hidden_keys_costs_snapshots_but_no_trut
         "policies": [{"rules": ["all"], "subjects": ["any"]}],
     }  # fmt: skip
     with Robot(endpoint, {"access_control": access}) as robot:
+        robot.publisher.serve("capture", lambda _: {})
         client = console(LOSES_DELTAS)
         client.wait_until()
         robot.frame(300)
-        time.sleep(0.5)  # more than two heartbeats
-        assert client.wait_until().sequence == 0
-        for _ in range(2):
-            robot.publisher.publish_status({"health": "ok"})
-        counters = converged(client, robot).counters
-        assert (counters.gaps, counters.resyncs) == (1, 1)
+        assert converged(client, robot).counters.recovered == 1
+        with open_session("client", connect=[endpoint]) as session:
+            assert ask(session, ROBOT, "capture") == {}
 
 
-def test_what_is_no_update_is_counted_and_the_map_fetched_anew(robot: Robot, console) -> None:
+def test_what_is_no_update_is_counted_and_harms_nothing(robot: Robot, console) -> None:
     robot.frame()
     client = converged(console(), robot)
-    robot.session.put(KEYS.delta, b"not an update")
-    robot.session.put(KEYS.status, b"not JSON")
-    until(lambda: client.counters.refused == 2, "the refusal")
+    for key in (KEYS.delta, KEYS.beat, KEYS.status):
+        robot.session.put(key, b"neither an update nor JSON")
+    until(lambda: client.counters.refused == 3, "the refusals")
     robot.frame()
-    assert converged(client, robot).counters.resyncs == 1
+    assert converged(client, robot).counters.resyncs == 0
 
 
 def test_a_console_that_cannot_keep_up_is_right_in_the_end(robot: Robot, console) -> None:
     client = console(waiting=4)
     client.wait_until()
-    original, client._apply = client._apply, lambda message: (time.sleep(0.02), original(message))
+    original = client._read
+    client._read = lambda *message: (time.sleep(0.02), original(*message))
     for _ in range(60):
         robot.frame()
-    counters = converged(client, robot).counters
-    assert counters.overflows >= 1
-    assert counters.resyncs >= 1
+    assert converged(client, robot).counters.overflows >= 1
 
 
-def test_states_of_a_console(endpoint: str, robot: Robot, console) -> None:
-    client = console(stale_after_s=0.3)
+def test_a_link_that_was_down_costs_what_was_missed(endpoint: str, robot: Robot, folder: Path) -> None:
+    """The console is behind a router of its own, which goes and comes back."""
+    beyond = f"unixsock-stream/{folder}/y"
+    with open_session("router", listen=[beyond], connect=[endpoint]):
+        session = open_session("client", connect=[beyond])
+        client = MapClient(session, ROBOT)
+        robot.frame()
+        converged(client, robot)
+    until(lambda: client.state == "disconnected", "the end of the link")
+    for _ in range(3):
+        robot.frame()
+    with client, open_session("router", listen=[beyond], connect=[endpoint]):
+        counters = converged(client, robot).counters
+        assert (counters.recovered, counters.resyncs) == (3, 0)
+    session.close()
+
+
+def test_states_of_a_console(endpoint: str, robot: Robot, console, monkeypatch) -> None:
+    client = console(stale_after_s=0.6)
     client.wait_until()
     robot.publisher.publish_status({"health": "ok"})
     until(lambda: client.status == {"health": "ok"}, "the status")
-    assert client.state == "live"
-    until(lambda: client.state == "stale", "staleness")
-    robot.frame()
+    time.sleep(1.0)
+    assert client.state == "live"  # by the beat alone
+    with robot.publisher._lock:  # what holds up the beat holds it up for all
+        until(lambda: client.state == "stale", "staleness")
     until(lambda: client.state == "live", "life again")
-    robot.publisher.publish_status({"health": "ok"})
-    until(lambda: client.status.get("sequence") == 1, "the status to tell the delta's number")
     robot.close()
     until(lambda: client.state == "disconnected", "the end")
-    with pytest.raises(TimeoutError, match=r"disconnected, map .* at 1 after 0\.05 s"):
+    with pytest.raises(TimeoutError, match=r"disconnected, map .* at 0 after 0\.05 s"):
         client.wait_until(sequence=2, timeout_s=0.05)
 
 
@@ -308,7 +319,7 @@ def test_a_robot_that_cannot_give_a_snapshot_is_asked_again(endpoint: str, conso
         voxels.add(observe(100, 0), 0)
 
         def snapshot() -> MapUpdate:
-            if next(tries) < 2:
+            if 0 < next(tries) < 3:  # the first is the publisher's own, for the epoch
                 raise InputError("not yet")
             return voxels.snapshot()
 
@@ -446,19 +457,29 @@ def test_a_session_opens_no_port_and_leaves_no_shared_memory(robot: Robot, conso
 
 
 CONSOLE = """
-import hashlib, sys, time
-from daemon.console import MapClient
-from daemon.transport import open_session
+import hashlib, os, signal, sys
+from daemon import console
+from daemon.transport import fetch, open_session
 endpoint, how = sys.argv[1:]
+
+def freeze_amid_a_snapshot(*arguments, **options):
+    for number, reply in enumerate(fetch(*arguments, **options)):
+        if number == 3 and console.fetch is not fetch:
+            console.fetch = fetch
+            print("frozen", flush=True)
+            os.kill(os.getpid(), signal.SIGSTOP)
+        yield reply
+
+if how == "freeze":
+    console.fetch = freeze_amid_a_snapshot
 session = open_session("client", connect=[endpoint])
-client = MapClient(session, "cell_1")
-print(len(client.wait_until()), flush=True)
+client = console.MapClient(session, "cell_1")
+print(len(client.wait_until(timeout_s=60)), flush=True)
 if how == "raise":
     raise SystemExit(3)
 if how == "leave":
     sys.exit(0)
-sequence = int(sys.stdin.readline())
-copy = client.wait_until(sequence=sequence, timeout_s=60).snapshot()
+copy = client.wait_until(sequence=int(sys.stdin.readline()), timeout_s=60).snapshot()
 print(hashlib.sha256(copy.index.tobytes() + copy.colour.tobytes()).hexdigest(), flush=True)
 """
 
@@ -521,26 +542,30 @@ def reachable(endpoint: str) -> bool:
 
 
 def test_a_frozen_console_stalls_nobody_else(robot: Robot, console, endpoint: str) -> None:
-    """With blocking puts each stall is 5 s; here the whole run of 20 MB must fit into less."""
-    client = console()
-    client.wait_until()
-    with start(CONSOLE, endpoint, "stay") as frozen:
+    """One that freezes amid a large snapshot is the worst: the rest of it waits to be sent, for 5 s."""
+    for _ in range(2):
+        robot.frame(150_000, 1.5)
+    client = converged(console(), robot)
+    with start(CONSOLE, endpoint, "freeze") as frozen:
         assert frozen.stdin is not None
         assert frozen.stdout is not None
         try:
-            frozen.stdout.readline()
-            os.kill(frozen.pid, signal.SIGSTOP)
-            longest = 0.0
-            for _ in range(20):
+            assert frozen.stdout.readline() == "frozen\n"
+            stalls, end = [], time.monotonic() + 6.0
+            while time.monotonic() < end:
                 update = robot.map.add(observe(40_000, 7, 0.25), 1)
                 begin = time.monotonic()
                 robot.publisher.publish(update)
-                longest = max(longest, time.monotonic() - begin)
-            assert longest < 2.0
-            converged(client, robot)
+                robot.publisher.publish_status({})
+                stalls.append(time.monotonic() - begin)
+                client.wait_until(sequence=update.sequence)
+            assert max(stalls) < 2.0  # 0.02 s measured; 4.8 s where the map waits with the snapshots
+            assert converged(client, robot).counters.resyncs == 0
+            converged(console(), robot)
             os.kill(frozen.pid, signal.SIGCONT)
             frozen.stdin.write(f"{robot.map.sequence}\n")
             frozen.stdin.flush()
+            assert frozen.stdout.readline().strip().isdigit()
             copy = robot.map.snapshot()
             wanted = hashlib.sha256(copy.index.tobytes() + copy.colour.tobytes()).hexdigest()
             assert frozen.stdout.readline().strip() == wanted
