@@ -75,6 +75,39 @@ def test_the_readme_names_files_that_exist():
         assert (ROOT / link).exists(), link
 
 
+def headings(page):
+    """The anchors of a page, as GitHub makes them of its headings."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_links_between_pages_resolve():
+    links = 0
+    for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]:
+        for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+            if re.match(r"[a-z]+:", link):
+                continue
+            links += 1
+            file, _, anchor = link.partition("#")
+            target = page.parent / file if file else page
+            assert target.exists(), f"{page.relative_to(ROOT)}: {link}"
+            assert not anchor or anchor in headings(target), f"{page.relative_to(ROOT)}: {link}"
+    assert links > 40
+
+
+def test_the_index_of_the_pages_is_complete():
+    index = (ROOT / "docs/README.md").read_text()
+    assert [page.name for page in (ROOT / "docs").glob("[!R]*.md") if f"]({page.name})" not in index] == []
+
+
+def test_the_tests_that_the_method_names_are_there():
+    named = re.findall(r"`(test_\w+\.py)::(test_\w+)`", (ROOT / "docs/method.md").read_text())
+    assert len(named) > 60
+    for file, test in named:
+        assert f"\ndef {test}(" in (ROOT / "tests" / file).read_text(), f"{file}::{test}"
+
+
 def test_the_tour_keeps_its_order():
     readme = (ROOT / "README.md").read_text()
     tour = re.findall(r"^\d\. \[`([^`]+)`\]", readme, re.MULTILINE)
