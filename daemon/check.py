@@ -156,7 +156,8 @@ def _check_paths(config: Config, note: _Notes) -> None:
             note.warn("recording", "captures are not recorded", "add a [recording] table to keep them")
         return
     directory = config.recording.directory
-    if _check_folder("recording", directory, note):
+    made = directory if directory.exists() else directory.parent  # the service makes the last folder
+    if _check_folder("recording", made, note) and directory.exists():
         free_mb = shutil.disk_usage(directory).free >> 20
         if free_mb < config.recording.min_free_mb:
             note.wrong(

@@ -125,8 +125,8 @@ class MapPublisher:
         """Sends how the robot is; once a second or so."""
         self._status.put(json.dumps(dict(status)))
 
-    def serve(self, command: str, handler: Handler) -> None:
-        """Answers a command from now on, one at a time, in a thread of its own.
+    def serve(self, command: str, handler: Handler, threads: int = 1) -> None:
+        """Answers a command from now on, in threads of its own: so many at a time.
 
         The handler gets the command's JSON object and returns the answer's. What it raises becomes
         an error reply, so that the one who asked always hears: an InputError or CommandError with its
@@ -138,7 +138,7 @@ class MapPublisher:
             parameters = parse_object(query.payload.to_bytes(), key) if query.payload is not None else {}
             query.reply(key, json.dumps(dict(handler(parameters))), encoding="application/json")
 
-        self._answering.append(_Answering(self._session, key, answer))
+        self._answering.append(_Answering(self._session, key, answer, threads))
 
     def _reply_snapshot(self, query: zenoh.Query) -> None:
         for part in encode_parts(self._snapshot()):

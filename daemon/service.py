@@ -353,6 +353,10 @@ class Service:
     def _save_map(self) -> None:
         if self._map_path is None or self._map_bytes is None:
             return
+        if not len(self._pipeline.map):
+            # A run that saw nothing must not take the last good map away.
+            log(_log, logging.WARNING, "map not written: it is empty", path=self._map_path)
+            return
         try:
             write_atomically(self._map_path, self._map_bytes(self._pipeline.map))
         except (OSError, InputError) as error:

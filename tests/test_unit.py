@@ -53,7 +53,7 @@ def test_unit_knows_the_services_exit_code_and_times():
     from daemon.service import EXIT_CONFIGURATION
 
     text = UNIT.read_text()
-    assert f"RestartPreventExitStatus={EXIT_CONFIGURATION}\n" in text
+    assert f"RestartPreventExitStatus=2 {EXIT_CONFIGURATION}\n" in text
     times = {key: int(value) for key, value in re.findall(r"^(\w+Sec)=(\d+)$", text, re.MULTILINE)}
     limits = Limits()
     # A hang is told in the status before the watchdog strikes, and a stop may wait for two captures.

@@ -228,7 +228,7 @@ def test_process_is_ready_soon_reloads_and_stops_whole(site, monkeypatch):
         channel.close()
     assert process.returncode == 0, err
     assert "heavy: []" in out
-    assert (site / "map.npz").exists()
+    assert not (site / "map.npz").exists()  # an empty map must not replace the last good one
     assert not list((site / "recordings").iterdir())  # no capture, no file
     assert "device error" in err
 
@@ -267,7 +267,7 @@ def test_check_tells_a_missing_device_from_a_wrong_file(site):
     assert verdicts["colour"].verdict is Verdict.OK
     assert "capture" not in verdicts
     assert check.exit_code(findings) == 69
-    wrong = [*base, "model=rig.toml", "recording.directory=absent"]
+    wrong = [*base, "model=rig.toml", "recording.directory=absent/absent"]
     findings = check.check(load_config(site / "surfclass.toml", wrong))
     count = Counter(finding.subject for finding in findings if finding.verdict is Verdict.CONFIGURATION)
     assert count == {"rig and model": 1, "recording": 1}
