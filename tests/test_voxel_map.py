@@ -175,6 +175,8 @@ def test_no_class_ever_reaches_zero_and_a_voxel_can_change_its_mind() -> None:
     strong = np.repeat(sure_of(0, 0.999), 500, axis=0)
     for t_ns in range(4):
         voxels.add(one_voxel(strong, strong, 1.0), t_ns)
+    # Eq. 3.9 as a product of float64 probabilities: what is 0 once stays 0 whatever comes later.
+    assert np.prod(np.exp(strong[:, 3].astype(np.float64))) == 0
     for pool in ("linear", "log-linear"):
         layers = voxels.fused(pool)
         for p in (layers.p_colour, layers.p_texture, layers.p):
