@@ -96,6 +96,7 @@ class MapClient:
         self._changed = threading.Condition()
         self._inbox: deque[tuple[_Job, bytes]] = deque()
         self._robots: set[str] = set()
+        self._heard = False
         self._status: dict[str, Any] = {}
         self._heard_s = time.monotonic()
         self._need: _Job | None = _Job.FETCH_ALL
@@ -137,7 +138,7 @@ class MapClient:
         "resyncing": it is not, and is being fetched. "disconnected": there is no such robot here.
         """
         with self._changed:
-            if not self._robots or not self._worker.is_alive():
+            if not self._is_there() or not self._worker.is_alive():
                 return "disconnected"
             if self._need or self._fetching or self._map is None:
                 return "resyncing"
@@ -212,7 +213,9 @@ class MapClient:
 
     def _take(self, kind: _Job, sample: zenoh.Sample) -> None:
         with self._changed:
-            self._heard_s = time.monotonic()
+            if not self._is_there():
+                self._need = self._need or _Job.FETCH_MISSED
+            self._heard, self._heard_s = True, time.monotonic()
             self._inbox.append((kind, sample.payload.to_bytes()))
             if len(self._inbox) > self._waiting:
                 self._inbox.clear()
@@ -232,6 +235,10 @@ class MapClient:
             self._status = status
             self._changed.notify_all()
 
+    def _is_there(self) -> bool:
+        # By the beat as well: routers that find each other again have been seen to lose tokens.
+        return bool(self._robots) or (self._heard and self.silent_s < self._stale_after_s)
+
     def _take_life(self, sample: zenoh.Sample) -> None:
         who = str(sample.key_expr)
         with self._changed:
@@ -242,6 +249,7 @@ class MapClient:
                 self._need = self._need or _Job.FETCH_MISSED
             else:
                 self._robots.discard(who)
+                self._heard = False
             self._changed.notify_all()
 
     # In the worker.
@@ -267,7 +275,7 @@ class MapClient:
         """Waits for something to do; None is the end."""
         with self._changed:
             while not self._closing:
-                if self._need is not None and self._robots:
+                if self._need is not None and self._is_there():
                     need, self._need, self._fetching = self._need, None, True
                     return need if self._map is not None else _Job.FETCH_ALL, b""
                 if self._map is None:

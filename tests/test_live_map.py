@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -279,21 +281,58 @@ def test_a_console_that_cannot_keep_up_is_right_in_the_end(robot: Robot, console
     assert converged(client, robot).counters.overflows >= 1
 
 
-def test_a_link_that_was_down_costs_what_was_missed(endpoint: str, robot: Robot, folder: Path) -> None:
-    """The console is behind a router of its own, which goes and comes back."""
-    beyond = f"unixsock-stream/{folder}/y"
-    with open_session("router", listen=[beyond], connect=[endpoint]):
-        session = open_session("client", connect=[beyond])
+class Cable:
+    """A link between a Unix socket of its own and the robot's, which can be cut; as context it is whole."""
+
+    def __init__(self, here: Path, there: str) -> None:
+        self._here, self._there = here, there
+        self._ends: list[socket.socket] = []
+
+    def __enter__(self) -> None:
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(str(self._here))
+        listener.listen()
+        self._ends.append(listener)
+        threading.Thread(target=self._accept, args=[listener], daemon=True).start()
+
+    def __exit__(self, *_: object) -> None:
+        self._here.unlink()
+        for end in self._ends:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+        self._ends.clear()
+
+    def _accept(self, listener: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = listener.accept()
+                far = socket.socket(socket.AF_UNIX)
+                far.connect(self._there)
+                self._ends += [near, far]
+                for source, target in ((near, far), (far, near)):
+                    threading.Thread(target=self._pump, args=[source, target], daemon=True).start()
+
+    @staticmethod
+    def _pump(source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65_536):
+                target.sendall(data)
+
+
+def test_a_link_that_was_down_costs_only_what_was_missed(endpoint: str, robot: Robot, folder: Path) -> None:
+    cable = Cable(folder / "y", str(folder / "z"))
+    with cable:
+        session = open_session("client", connect=[f"unixsock-stream/{folder}/y"])
         client = MapClient(session, ROBOT)
         robot.frame()
         converged(client, robot)
     until(lambda: client.state == "disconnected", "the end of the link")
     for _ in range(3):
         robot.frame()
-    with client, open_session("router", listen=[beyond], connect=[endpoint]):
+    with cable, session, client:
         counters = converged(client, robot).counters
         assert (counters.recovered, counters.resyncs) == (3, 0)
-    session.close()
 
 
 def test_states_of_a_console(endpoint: str, robot: Robot, console, monkeypatch) -> None:
