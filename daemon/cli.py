@@ -185,12 +185,18 @@ def evaluate(
 ) -> None:
     """Accuracy against the labels of the `test` captures: voxels, pixels, calibration."""
     from daemon import offline
+    from daemon.files import check_output
 
     settings = _settings(thesis, update, pool)
     if (model is None) == (map_ is None):
         raise typer.BadParameter(
             "give --model MODEL to make the map anew, or --map MAP.npz to score a finished one"
         )
+    if map_ is not None and (thesis or update or pool or route is not Route.all):
+        raise typer.BadParameter(
+            "--map MAP.npz is scored as it is: without --route, --thesis, --update, --pool"
+        )
+    check_output(json_, png)
     if model is not None:
         result = offline.evaluate_recording(recording, model, route.value, settings)
         offline.print_evaluation(result)
@@ -206,7 +212,7 @@ def evaluate(
     if require is not None:
         routes = result["routes"]
         gate = "combined" if "combined" in routes else next(iter(routes))
-        reached = routes[gate]["fused"]["overall"]
+        reached = routes[gate]["fused"]["overall"] or 0.0  # none where no labelled pixel has depth
         verdict = "PASS" if reached >= require else "FAIL"
         offline.console.print(f"{verdict}: {gate} {reached:.1%} of the voxels right, {require:.1%} required")
         raise typer.Exit(0 if reached >= require else EXIT_GATE_FAILED)
@@ -306,6 +312,14 @@ def check(config: ConfigOption = None, set_: SetOption = None, json_: JsonOption
     raise typer.Exit(live.check(config, set_ or [], json_))
 
 
+@app.command("light-off")
+def light_off(config: ConfigOption = None, set_: SetOption = None) -> None:
+    """Turn the light off, whatever became of the service; the unit calls this after every stop."""
+    from daemon import live
+
+    live.light_off(config, set_ or [])
+
+
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")] = Path("out/demo"),
@@ -346,10 +360,15 @@ def main() -> None:
         # The reader of our standard output has gone; nothing is left to say, to nobody.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_GATE_FAILED)
-    except OSError as error:  # a full disk, a missing permission: the message names the file
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError) as error:
+        sys.exit(_say(error, EXIT_USAGE))  # a path that was given; the message names it
+    except OSError as error:  # a full disk
         sys.exit(_say(error, EXIT_DEVICE))
 
 
 def _say(error: Exception, code: int) -> int:
-    sys.stderr.write(f"surfclass: {error}\n")
+    lines = str(error).splitlines()
+    if len(lines) == 2:  # a heading and one fault below it
+        lines = [f"{lines[0]} {lines[1].strip()}"]
+    sys.stderr.write("\n".join([f"surfclass: {lines[0]}", *lines[1:]]) + "\n")
     return code

@@ -8,15 +8,32 @@ from pathlib import Path
 from surfclass.errors import InputError
 
 
+def check_output(*paths: Path | str | None) -> None:
+    """Says before the work, and not after it, that a result cannot be written.
+
+    Args:
+        paths: Where results will go; None and "-", which is standard output, are no files.
+
+    Raises:
+        InputError: If a directory does not exist or cannot be written to, or a path is a directory.
+    """
+    for path in (Path(path) for path in paths if path is not None and path != "-"):
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: there is no directory {path.parent}")
+        if path.is_dir():
+            raise InputError(f"{path}: is a directory, and a file is to be written")
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise InputError(f"{path}: the directory {path.parent} cannot be written to")
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Writes `data` to `path`, which afterwards is the old file or the new one, never a part.
 
     Raises:
-        InputError: If the directory does not exist.
+        InputError: As `check_output`.
         OSError: If the disk refuses.
     """
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: there is no directory {path.parent}")
+    check_output(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as stream:

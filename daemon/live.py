@@ -18,11 +18,11 @@ from daemon.check import Verdict, exit_code
 from daemon.check import check as check_all
 from daemon.config import Config, load_config
 from daemon.console import MapClient
-from daemon.files import write_atomically
+from daemon.files import check_output, write_atomically
 from daemon.offline import console, progress, write_json
 from daemon.transport import TransportError, open_session
 from drivers.recording import RecordingWriter, unix_offset_ns
-from surfclass.errors import ConfigurationError, InputError
+from surfclass.errors import ConfigurationError
 from surfclass.map_file import to_npz_bytes
 from surfclass.pooling import Pool
 from surfclass.voxel_map import VoxelMap
@@ -58,6 +58,7 @@ def capture(
         DriverError, CaptureRejectedError: As the devices do.
         ConfigurationError: If the configuration has no devices.
     """
+    check_output(out)
     told = _load(config, overrides)
     rig_text, rig = wiring.rig_of(told)
     sensors = wiring.build_sensors(told)
@@ -92,6 +93,7 @@ def watch(
     It ends by Ctrl-C or SIGTERM, when the service that it saw has gone (`until_gone`), when the map
     holds so many `captures`, or with exit code 69 when `timeout_s` is over before that.
     """
+    check_output(out, json_file)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -134,7 +136,7 @@ def _connected(connect: Sequence[str], stop: threading.Event, deadline_s: float 
     """Returns a session as soon as the service is there.
 
     Raises:
-        InputError: If it was told to stop before that, or the time is over.
+        TransportError: If it was told to stop before that, or the time is over.
     """
     while True:
         try:
@@ -142,7 +144,7 @@ def _connected(connect: Sequence[str], stop: threading.Event, deadline_s: float 
         except TransportError as error:
             late = deadline_s is not None and time.monotonic() > deadline_s
             if stop.wait(_CONNECT_RETRY_S) or late:
-                raise InputError(f"nothing answers at {', '.join(connect)}: {error}") from None
+                raise TransportError(f"nothing answers at {', '.join(connect)}: {error}") from None
 
 
 def _holds(client: MapClient, captures: int) -> bool:
@@ -154,7 +156,7 @@ def _await_status(client: MapClient, deadline_s: float | None) -> None:
     give_up_s = min(time.monotonic() + 5.0, deadline_s or float("inf"))
     while time.monotonic() < give_up_s:
         found = client.map
-        if found is not None and client.status.get("sequence", -1) >= found.sequence:
+        if found is not None and client.status.get("map", {}).get("sequence", -1) >= found.sequence:
             return
         time.sleep(0.1)
 
@@ -187,6 +189,7 @@ def _line_of(told: dict[str, Any]) -> str:
 
 def check(config: Path | None, overrides: Sequence[str], json_file: str | None) -> int:
     """Looks at everything the service needs, prints what was found, and returns the exit code."""
+    check_output(json_file)
     findings = check_all(_load(config, overrides))
     table = Table(show_header=True)
     for heading in ("", "what", "found", "what to do"):
@@ -199,3 +202,12 @@ def check(config: Path | None, overrides: Sequence[str], json_file: str | None) 
     code = exit_code(findings)
     console.print("PASS: everything works" if code == os.EX_OK else "FAIL: see the marked lines")
     return code
+
+
+def light_off(config: Path | None, overrides: Sequence[str]) -> None:
+    """Turns the configured light off.
+
+    Raises:
+        DriverError: If it cannot be reached.
+    """
+    wiring.lights_off(_load(config, overrides))

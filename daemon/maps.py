@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import pictures
-from daemon.files import read_file
+from daemon.files import check_output, read_file
 from daemon.offline import console, load_map, load_model
 from drivers.recording import Recording
 from surfclass.errors import InputError
@@ -24,6 +24,7 @@ _PALETTE = ("#d55e00", "#999999", "#009e73", "#e69f00", "#56b4e9", "#cc79a7", "#
 
 def show(path: Path, png: Path | None, ply: Path | None, classes_path: Path | None) -> None:
     """Draws a map, or writes it as PLY, or both; without either, says what is in it."""
+    check_output(png, ply)
     found = load_map(path)
     classes = _classes(found, classes_path)
     layers = found.layers
@@ -55,9 +56,12 @@ def write_ply(path: Path, found: MapFile, class_rgb: NDArray[np.uint8]) -> None:
     cloud.points = open3d.utility.Vector3dVector(centres)
     cloud.colors = open3d.utility.Vector3dVector(class_rgb[found.layers.p.argmax(axis=1)] / 255.0)
     part = path.with_name(f".{path.stem}.part.ply")
-    if not open3d.io.write_point_cloud(part, cloud):
-        raise InputError(f"{path}: the PLY could not be written")
-    part.replace(path)
+    try:
+        if not open3d.io.write_point_cloud(part, cloud):
+            raise InputError(f"{path}: the PLY could not be written")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _classes(found: MapFile, path: Path | None) -> SurfaceClasses:
@@ -75,6 +79,7 @@ def _classes(found: MapFile, path: Path | None) -> SurfaceClasses:
 
 def show_captures(recording_path: Path, png: Path, names: list[str], model_path: Path | None) -> None:
     """Draws captures in rows: colour, depth, truth and, with a model, what each route makes of them."""
+    check_output(png)
     recording = Recording.open(recording_path)
     rows: list[tuple[str, list[tuple[str, pictures.RGB]]]] = []
     pipeline = None

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from daemon.files import read_file, write_atomically
+from daemon.files import check_output, read_file, write_atomically
 from drivers.folder import read_folder
 from drivers.recording import Recording, RecordingWriter
 from surfclass.errors import ConfigurationError, InputError
@@ -32,7 +32,8 @@ console = Console(stderr=True)
 def progress(total: int, what: str) -> Iterator[Any]:
     """Shows a bar on standard error; yields `advance(description)`."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    # A log or a pipe gets no bar; the library would leave an empty line there.
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=total)
 
         def advance(description: str) -> None:
@@ -56,9 +57,11 @@ def import_folder(directory: Path, out: Path) -> int:
     Raises:
         InputError: Naming the file and what is wrong with it; nothing is written then.
     """
+    check_output(out)
     folder = read_folder(directory)
+    source = directory.resolve().name  # "." has none
     writer = RecordingWriter(
-        out, folder.rig_text, folder.classes_text, {"source": directory.name}, plate_text=folder.plate_text
+        out, folder.rig_text, folder.classes_text, {"source": source}, plate_text=folder.plate_text
     )
     try:
         with progress(len(folder), "importing") as advance:
@@ -86,6 +89,7 @@ def load_model(path: Path) -> Model:
 
 def train_model(recording_path: Path, out: Path, settings: TrainingSettings) -> Model:
     """Trains from a recording's `train` captures and writes the model."""
+    check_output(out)
     recording = Recording.open(recording_path)
     if recording.classes is None:
         raise InputError(f"{recording_path}: has no classes.toml, so its labels mean nothing")
@@ -115,6 +119,7 @@ def replay(
     Returns:
         The pipeline, and for each stage its milliseconds, capture by capture.
     """
+    check_output(out)
     recording = Recording.open(recording_path)
     model = load_model(model_path)
     model.check(recording.rig, recording.classes)

@@ -8,6 +8,7 @@ import queue
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,11 +139,11 @@ def build_pipeline(config: Config) -> Pipeline:
     """Returns the pipeline of the configured rig, or of the replayed recording's, and the model.
 
     Raises:
-        InputError: If a file cannot be read.
-        ConfigurationError: If one is not valid, or they do not fit each other.
+        InputError: If the recording cannot be read.
+        ConfigurationError: If a file is missing or not valid, or they do not fit each other.
     """
     rig = rig_of(config)[1]
-    model = Model.from_bytes(read_file(config.model, "model"), str(config.model))
+    model = Model.from_bytes(_read(config.model, "model"), str(config.model))
     return Pipeline(rig, model, PipelineSettings(config.pipeline.update, config.pipeline.pool))
 
 
@@ -157,8 +158,16 @@ def rig_of(config: Config) -> tuple[str, Rig]:
         return recording.rig_text, recording.rig
     if config.rig is None:
         raise ConfigurationError("rig is missing (only a replayed recording brings its own)")
-    data = read_file(config.rig, "rig")
+    data = _read(config.rig, "rig")
     return data.decode(errors="replace"), parse_rig(data, str(config.rig))
+
+
+def _read(path: Path, what: str) -> bytes:
+    """The bytes of a file that the configuration names: without it the service cannot ever start."""
+    try:
+        return read_file(path, what)
+    except InputError as error:
+        raise ConfigurationError(str(error)) from None
 
 
 def build_trigger(settings: TriggerSettings) -> Trigger:

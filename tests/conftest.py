@@ -13,3 +13,19 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"reference data is not beside the project ({SHARED.name}/ is missing)")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def commissioned(tmp_path_factory):
+    """The simulated cell through `import`, `train` and `replay`, once for all tests of the command line.
+
+    Trained by naive Bayes, which takes a tenth of the time; the kitchen is trained by default.
+    """
+    from cli_site import Cell, surfclass, write_cell  # the simulator; most tests do without
+
+    made = Cell(tmp_path_factory.mktemp("cell"))
+    write_cell(made.folder)
+    surfclass("import", made.folder, made.recording, cwd=made.root)
+    surfclass("train", made.recording, "--out", made.model, "--classifier", "naive-bayes", cwd=made.root)
+    surfclass("replay", made.recording, "--model", made.model, "--map", made.map, cwd=made.root)
+    return made
