@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -54,6 +55,8 @@ def test_the_same_map_gives_the_same_bytes_whatever_its_history() -> None:
         second.apply(type(delta)("a" * 32, 1, 0, *[getattr(delta, name)[rows] for name in columns]))
     assert to_npz_bytes(second) == to_npz_bytes(first)
     assert to_npz_bytes(first, "linear") != to_npz_bytes(first)
+    entries = zipfile.ZipFile(io.BytesIO(to_npz_bytes(first))).infolist()
+    assert {(entry.date_time, entry.create_system) for entry in entries} == {((1980, 1, 1, 0, 0, 0), 3)}
 
 
 def test_a_file_read_back_is_the_map() -> None:
