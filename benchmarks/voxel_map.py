@@ -1,4 +1,4 @@
-"""Times a frame of 1.1 million pixels into maps of 10⁴ to 10⁶ voxels, and what a console does with the result.
+"""Times a frame of 1.1 million pixels into maps of 10⁴ to 10⁶ voxels, and what a console does with it.
 
 Run it from the project's folder: `python -m benchmarks.voxel_map`. The alternative is what numpy offers for
 summing by voxel: `np.unique` over all pixels, then `np.add.at`.
