@@ -49,6 +49,7 @@ from surfclass.rig import Rig, parse_rig
 from surfclass.wire import encode_update
 
 if TYPE_CHECKING:
+    from drivers.sim.views import Viewpoint
     from drivers.sim.world import SimWorld
 
 logger = logging.getLogger("surfclass.wiring")
@@ -130,9 +131,16 @@ def build_world(config: Config) -> SimWorld:
         SimClock(sim.realtime),
         Faults(tuple(faults)),
         scale=sim.scale,
-        program=scenes.viewpoints(sim.scene)[: sim.viewpoints],
+        program=_spread(scenes.viewpoints(sim.scene), sim.viewpoints),
         ambient=sim.ambient,
     )
+
+
+def _spread(places: tuple[Viewpoint, ...], count: int | None) -> list[Viewpoint]:
+    """Returns `count` of the places, in order and evenly spread from the first to the last."""
+    if count is None or count >= len(places):
+        return list(places)
+    return [places[round(i)] for i in np.linspace(0, len(places) - 1, count)]
 
 
 def build_pipeline(config: Config) -> Pipeline:
@@ -265,7 +273,8 @@ def build_service(
         reload=None if load is None else Reload(config, load, acquisition, sensors),
         exit_when_done=exit_when_done,
     )
-    publisher.serve("capture", service.capture)
+    # One more than may wait, so that the next one hears at once that the robot is busy.
+    publisher.serve("capture", service.capture, threads=config.limits.waiting_requests + 1)
     return service
 
 
