@@ -254,11 +254,25 @@ def capture(
     count: Annotated[int, typer.Option(min=1, help="How many captures.")] = 1,
     role: Annotated[str, typer.Option(help="What they are for: map, train, test, light, …")] = "map",
     dark: Annotated[bool, typer.Option("--dark", help="Take an unlit frame with each.")] = False,
+    classes: Annotated[
+        Path | None,
+        typer.Option(metavar="CLASSES.toml", help="What the labels mean; goes into the recording."),
+    ] = None,
+    surface: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="A board of this surface fills the image; may be repeated."),
+    ] = None,
 ) -> None:
-    """Take captures with the configured devices and write a recording."""
+    """Take captures with the configured devices and write a recording.
+
+    To train: `--role train --classes classes.toml --surface rusted --surface timber …` asks for one
+    board after the other and labels the whole image with it.
+    """
     from daemon import live
 
-    live.capture(out, config, set_ or [], count, role, dark)
+    if surface and classes is None:
+        raise typer.BadParameter("--surface needs --classes CLASSES.toml, which lists the surfaces")
+    live.capture(out, config, set_ or [], count, role, dark, classes, surface or [])
 
 
 @app.command()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from daemon import wiring
@@ -18,13 +21,14 @@ from daemon.check import Verdict, exit_code
 from daemon.check import check as check_all
 from daemon.config import Config, load_config
 from daemon.console import MapClient
-from daemon.files import check_output, write_atomically
+from daemon.files import check_output, read_file, write_atomically
 from daemon.offline import console, progress, write_json
 from daemon.transport import TransportError, open_session
 from drivers.recording import RecordingWriter, unix_offset_ns
-from surfclass.errors import ConfigurationError
+from surfclass.errors import ConfigurationError, InputError
 from surfclass.map_file import to_npz_bytes
 from surfclass.pooling import Pool
+from surfclass.rig import parse_classes
 from surfclass.voxel_map import VoxelMap
 
 _MARKS = {
@@ -50,32 +54,66 @@ def run(config: Path | None, overrides: Sequence[str], replay: Path | None, exit
 
 
 def capture(
-    out: Path, config: Path | None, overrides: Sequence[str], count: int, role: str, dark: bool
+    out: Path,
+    config: Path | None,
+    overrides: Sequence[str],
+    count: int,
+    role: str,
+    dark: bool,
+    classes_path: Path | None = None,
+    surfaces: Sequence[str] = (),
 ) -> None:
     """Takes captures with the configured devices into a recording; all of them, or none is kept.
+
+    Args:
+        out: The recording.
+        config: The configuration file.
+        overrides: `--set` options.
+        count: How many captures, of each surface if there are any.
+        role: What they are for.
+        dark: Whether to take an unlit frame with each.
+        classes_path: A classes.toml for the recording.
+        surfaces: Boards that fill the image one after the other; the whole image is labelled so.
 
     Raises:
         DriverError, CaptureRejectedError: As the devices do.
         ConfigurationError: If the configuration has no devices.
+        InputError: If a surface is not one of the classes.
     """
     check_output(out)
     told = _load(config, overrides)
     rig_text, rig = wiring.rig_of(told)
+    classes_text = (
+        None if classes_path is None else read_file(classes_path, "classes").decode(errors="replace")
+    )
+    names = () if classes_text is None else parse_classes(classes_text, str(classes_path)).names
+    for surface in surfaces:
+        if surface not in names:
+            raise InputError(f"--surface {surface}: {classes_path} has {', '.join(names)}")
     sensors = wiring.build_sensors(told)
     offset_ns = 0 if told.simulated else unix_offset_ns()
-    writer = RecordingWriter(out, rig_text, None, {"robot": told.robot}, unix_offset_ns=offset_ns)
+    writer = RecordingWriter(out, rig_text, classes_text, {"robot": told.robot}, unix_offset_ns=offset_ns)
+    boards: list[str | None] = [*surfaces] or [None]
     try:
-        with sensors.package as package, progress(count, "capturing") as advance:
-            for number in range(1, count + 1):
-                taken = package.capture(f"{role}_{number:04d}", role, with_dark=dark)
-                rig.check(taken)
-                writer.write(taken)
-                advance(taken.name)
+        with sensors.package as package:
+            for board in boards:
+                if board is not None and sys.stdin.isatty():
+                    console.input(f"Put up a board of [bold]{board}[/bold] that fills the image; then Enter ")
+                with progress(count, f"capturing {board or ''}") as advance:
+                    for number in range(1, count + 1):
+                        name = f"{role}_{board}_{number:04d}" if board else f"{role}_{number:04d}"
+                        taken = package.capture(name, role, with_dark=dark)
+                        rig.check(taken)
+                        if board is not None:
+                            label = np.full(rig.rgb.shape, names.index(board) + 1, np.uint8)
+                            taken = replace(taken, label=label)
+                        writer.write(taken)
+                        advance(taken.name)
     except BaseException:
         writer.discard()
         raise
     writer.close()
-    console.print(f"{out}: {count} captures")
+    console.print(f"{out}: {count * len(boards)} captures")
 
 
 def watch(

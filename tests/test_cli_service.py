@@ -198,6 +198,26 @@ class TestCapture:
         found = from_npz_bytes((tmp_path / "map.npz").read_bytes(), "map.npz")
         assert np.abs(found.layers.index).max() < 300
 
+    def test_boards_of_surfaces_are_labelled_and_can_be_trained_from(self, commissioned, tmp_path):
+        configuration = commissioned.configuration(tmp_path)
+        boards = [word for name in CLASSES for word in ("--surface", name)]
+        arguments = (
+            "-c",
+            configuration,
+            "--role",
+            "train",
+            "--classes",
+            commissioned.folder / "classes.toml",
+        )
+        surfclass("capture", "t.mcap", *arguments, *boards[:4], cwd=tmp_path)
+        captures = list(Recording.open(tmp_path / "t.mcap").captures("train"))
+        assert [c.name for c in captures] == ["train_rusted_0001", "train_blasted_0001"]
+        assert [set(np.unique(c.label)) for c in captures] == [{1}, {2}]
+        refused = surfclass("train", "t.mcap", "--out", "m.npz", cwd=tmp_path, code=2)
+        assert "painted, timber, cardboard" in refused.stderr
+        done = surfclass("capture", "x.mcap", *arguments, "--surface", "mud", cwd=tmp_path, code=2)
+        assert "--surface mud" in done.stderr
+
     @pytest.mark.parametrize(
         ("arguments", "said", "code"),
         [
