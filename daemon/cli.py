@@ -338,7 +338,7 @@ def light_off(config: ConfigOption = None, set_: SetOption = None) -> None:
 def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")] = Path("out/demo"),
     seed: Annotated[int, typer.Option(min=0, help="Of the simulated cell.")] = 0,
-    viewpoints: Annotated[int, typer.Option(min=1, max=10, help="How many places to visit.")] = 10,
+    viewpoints: Annotated[int, typer.Option(min=1, max=15, help="How many places to visit.")] = 10,
 ) -> None:
     """Everything once, on the simulated cell: commission, train, map with a service, watch it, score it."""
     from daemon.demo import run_demo
