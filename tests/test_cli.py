@@ -286,4 +286,3 @@ def test_the_printed_method_on_a_renderers_pictures(shared, tmp_path):
         np.mean([routes[route]["pixels"][name]["overall"] for name in names]) for route in ("kd", "ab", "rgb")
     )
     assert kd >= ab >= rgb
-    assert kd > 0.7
