@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -146,7 +147,9 @@ def train(
 
 @app.command()
 def replay(
-    recording: RecordingArgument,
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC.mcap", help="A recording, or its parts in order.")
+    ],
     model: ModelOption,
     map_: Annotated[Path, typer.Option("--map", metavar="OUT.npz", help="Where the map goes.")],
     thesis: ThesisOption = False,
@@ -156,7 +159,7 @@ def replay(
     """Run a recording's `map` and `test` captures through the pipeline; the same bytes every time."""
     from daemon import offline
 
-    pipeline, stage_ms = offline.replay(recording, model, map_, _settings(thesis, update, pool))
+    pipeline, stage_ms = offline.replay(recordings, model, map_, _settings(thesis, update, pool))
     offline.print_stages(stage_ms)
     offline.console.print(f"{map_}: {len(pipeline.map):,} voxels of {pipeline.map.size_m * 1000:g} mm")
 
@@ -360,6 +363,8 @@ def main() -> None:
     from drivers.errors import CaptureRejectedError, DriverError, DriverUnavailableError
     from surfclass.errors import ConfigurationError, InputError
 
+    # A stop from outside unwinds like an error does, so that nothing is left half-written.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         app()
     except ConfigurationError as error:

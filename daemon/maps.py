@@ -94,8 +94,9 @@ def show_captures(recording_path: Path, png: Path, names: list[str], model_path:
             ("depth", depth_picture(capture.depth.depth_mm)),
         ]
         palette = None if recording.classes is None else recording.classes.rgb
-        if capture.label is not None and palette is not None:
-            row.append(("truth", pictures.coloured(capture.label, palette)))
+        if palette is not None:
+            label = np.zeros(image.shape[:2], np.uint8) if capture.label is None else capture.label
+            row.append(("truth", pictures.coloured(label, palette)))
         if pipeline is not None:
             row += route_pictures(pipeline, capture)
         rows.append((capture.name, row))
@@ -104,8 +105,7 @@ def show_captures(recording_path: Path, png: Path, names: list[str], model_path:
         raise InputError(
             f"{recording_path}: no colour capture named {', '.join(sorted(absent)) or 'anything'}"
         )
-    width = min(len(row) for _, row in rows)
-    pictures.draw_views(png, [(name, row[:width]) for name, row in rows])
+    pictures.draw_views(png, rows)
     console.print(f"{png}: {len(rows)} captures")
 
 

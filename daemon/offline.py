@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -112,29 +113,35 @@ def train_model(recording_path: Path, out: Path, settings: TrainingSettings) -> 
 
 
 def replay(
-    recording_path: Path, model_path: Path, out: Path, settings: PipelineSettings
+    paths: Sequence[Path], model_path: Path, out: Path, settings: PipelineSettings
 ) -> tuple[Pipeline, dict[str, list[float]]]:
-    """Runs a recording's captures through the pipeline and writes the map.
+    """Runs the captures of a recording, or of the parts of one, through the pipeline and writes the map.
 
     Returns:
         The pipeline, and for each stage its milliseconds, capture by capture.
+
+    Raises:
+        InputError: If a file is no recording, the parts have different rigs, or nothing is to be mapped.
     """
     check_output(out)
-    recording = Recording.open(recording_path)
+    parts = [Recording.open(path) for path in paths]
+    for path, part in zip(paths, parts, strict=True):
+        if (part.rig_text, part.classes_text) != (parts[0].rig_text, parts[0].classes_text):
+            raise InputError(f"{path}: has another rig or other classes than {paths[0]}")
     model = load_model(model_path)
-    model.check(recording.rig, recording.classes)
-    pipeline = Pipeline(recording.rig, model, settings)
+    model.check(parts[0].rig, parts[0].classes)
+    pipeline = Pipeline(parts[0].rig, model, settings)
     stage_ms: dict[str, list[float]] = {}
     done = 0
-    with progress(len(recording), "replaying") as advance:
-        for capture in recording.captures():
+    with progress(sum(map(len, parts)), "replaying") as advance:
+        for capture in chain.from_iterable(part.captures() for part in parts):
             if capture.role in MAP_ROLES:
                 for stage, ms in pipeline.process(capture).stage_ms.items():
                     stage_ms.setdefault(stage, []).append(ms)
                 done += 1
             advance(capture.name)
     if not done:
-        raise InputError(f"{recording_path}: no capture of role {' or '.join(MAP_ROLES)} to make a map of")
+        raise InputError(f"{paths[0]}: no capture of role {' or '.join(MAP_ROLES)} to make a map of")
     write_atomically(out, to_npz_bytes(pipeline.map, settings.pool))
     return pipeline, stage_ms
 

@@ -74,7 +74,11 @@ def _fault(table: type[BaseModel], fault: Any) -> str:
         return f"{path}: unknown key{hint} (known here: {', '.join(sorted(known))})"
     if fault["type"] == "missing":
         return f"{path}: missing"
-    return f"{path}: {fault['msg'][0].lower()}{fault['msg'][1:]}, got {fault['input']!r:.80}"
+    message = fault["msg"].removeprefix("Value error, ")
+    message = message[0].lower() + message[1:]
+    if isinstance(fault["input"], Mapping):  # what is wrong is between its keys; all of it is no help
+        return f"{path}: {message}" if path else message
+    return f"{path}: {message}, got {fault['input']!r:.80}"
 
 
 def _known_keys(table: type[BaseModel], path: tuple[Any, ...]) -> list[str]:

@@ -54,7 +54,7 @@ class TrainingSettings:
 
     classifier: Literal["svm", "naive_bayes"] = "svm"
     reflectance: ReflectanceMode | None = None
-    pixels_per_class: int = 1000
+    pixels_per_class: int = 1500
     windows_per_class: int = 1000
     window_px: int = 20
     place_px: int = 80

@@ -18,7 +18,7 @@ from cli_site import (
 )
 from mcap.reader import make_reader
 
-from drivers.recording import Recording
+from drivers.recording import Recording, RecordingWriter
 from surfclass.map_file import from_npz_bytes
 
 FIGURES = {"overall", "balanced", "ece", "nll", "rejected", "voxels", "confusion"}
@@ -96,6 +96,22 @@ class TestReplay:
         arguments = ("--model", commissioned.model, "--map", tmp_path / "again.npz")
         surfclass("replay", commissioned.recording, *arguments, cwd=tmp_path)
         assert (tmp_path / "again.npz").read_bytes() == commissioned.map.read_bytes()
+
+    def test_the_parts_of_a_recording_make_its_map(self, commissioned, tmp_path):
+        whole = Recording.open(commissioned.recording)
+        captures = list(whole.captures())
+        for name, part in (("a.mcap", captures[:-2]), ("b.mcap", captures[-2:])):
+            with RecordingWriter(tmp_path / name, whole.rig_text, whole.classes_text) as writer:
+                for capture in part:
+                    writer.write(capture)
+        arguments = ("--model", commissioned.model, "--map", "parts.npz")
+        surfclass("replay", "a.mcap", "b.mcap", *arguments, cwd=tmp_path)
+        assert (tmp_path / "parts.npz").read_bytes() == commissioned.map.read_bytes()
+        other = whole.rig_text.replace("simulated cell", "another cell")
+        with RecordingWriter(tmp_path / "c.mcap", other, whole.classes_text) as writer:
+            writer.write(captures[-1])
+        done = surfclass("replay", "a.mcap", "c.mcap", *arguments, cwd=tmp_path, code=2)
+        assert "c.mcap: has another rig" in done.stderr
 
     def test_the_boards_stay_out_of_the_map(self, commissioned, tmp_path):
         """They stood where the cell is, at another time."""
