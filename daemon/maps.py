@@ -17,6 +17,7 @@ from surfclass.errors import InputError
 from surfclass.map_file import MapFile
 from surfclass.pipeline import Pipeline, per_pixel
 from surfclass.rig import SurfaceClasses, parse_classes
+from surfclass.schema import validate
 
 # Okabe and Ito's colours, which remain distinct for colour-blind readers.
 _PALETTE = ("#d55e00", "#999999", "#009e73", "#e69f00", "#56b4e9", "#cc79a7", "#0072b2", "#f0e442")
@@ -28,13 +29,12 @@ def show(path: Path, png: Path | None, ply: Path | None, classes_path: Path | No
     found = load_map(path)
     classes = _classes(found, classes_path)
     layers = found.layers
-    known = layers.p.max(axis=1) > 1 / len(classes.names) + 1e-6
-    counts = np.bincount(layers.p[known].argmax(axis=1), minlength=len(classes.names))
+    label = layers.label()
+    counts = np.bincount(label, minlength=len(classes.names) + 1)
     console.print(f"{path}: {len(layers.index):,} voxels of {found.voxel_size_m * 1000:g} mm")
-    for name, count in zip(classes.names, counts, strict=True):
-        console.print(f"  {name:<12} {count:>8,}")
-    if not known.all():
-        console.print(f"  {'unknown':<12} {np.sum(~known):>8,}")
+    for name, count in zip((*classes.names, "unknown"), (*counts[1:], counts[0]), strict=True):
+        if count or name != "unknown":
+            console.print(f"  {name:<12} {count:>8,}")
     if png is not None:
         pictures.draw_map(png, layers, found.voxel_size_m, classes.names, classes.rgb)
         console.print(f"{png}: picture")
@@ -44,7 +44,7 @@ def show(path: Path, png: Path | None, ply: Path | None, classes_path: Path | No
 
 
 def write_ply(path: Path, found: MapFile, class_rgb: NDArray[np.uint8]) -> None:
-    """Writes the voxels' centres, in `base`, as a binary PLY coloured by class.
+    """Writes the voxels' centres, in `base`, as a binary PLY coloured by class, unknown ones dark.
 
     Raises:
         InputError: If the file cannot be written.
@@ -54,7 +54,7 @@ def write_ply(path: Path, found: MapFile, class_rgb: NDArray[np.uint8]) -> None:
     cloud = open3d.geometry.PointCloud()
     centres = (found.layers.index.astype(np.float64) + 0.5) * found.voxel_size_m
     cloud.points = open3d.utility.Vector3dVector(centres)
-    cloud.colors = open3d.utility.Vector3dVector(class_rgb[found.layers.p.argmax(axis=1)] / 255.0)
+    cloud.colors = open3d.utility.Vector3dVector(pictures.coloured(found.layers.label(), class_rgb) / 255.0)
     part = path.with_name(f".{path.stem}.part.ply")
     try:
         if not open3d.io.write_point_cloud(part, cloud):
@@ -65,10 +65,10 @@ def write_ply(path: Path, found: MapFile, class_rgb: NDArray[np.uint8]) -> None:
 
 
 def _classes(found: MapFile, path: Path | None) -> SurfaceClasses:
-    """The classes with their colours: from a file, or else from a palette that most eyes can tell apart."""
+    """The classes with their colours: from a file, from the map, or from a palette."""
     if path is None:
-        colours = tuple(_PALETTE[k % len(_PALETTE)] for k in range(len(found.classes)))
-        return SurfaceClasses(names=found.classes, colours=colours)
+        palette = tuple(_PALETTE[k % len(_PALETTE)] for k in range(len(found.classes)))
+        return validate(SurfaceClasses, {"names": found.classes, "colours": found.colours or palette}, "map")
     classes = parse_classes(read_file(path, "classes"), str(path))
     if classes.names != found.classes:
         raise InputError(
@@ -100,11 +100,10 @@ def show_captures(recording_path: Path, png: Path, names: list[str], model_path:
         if pipeline is not None:
             row += route_pictures(pipeline, capture)
         rows.append((capture.name, row))
-    absent = set(names) - {name for name, _ in rows}
+    absent = sorted(set(names) - {name for name, _ in rows})
     if absent or not rows:
-        raise InputError(
-            f"{recording_path}: no colour capture named {', '.join(sorted(absent)) or 'anything'}"
-        )
+        named = f" named {', '.join(absent)}" if absent else ""
+        raise InputError(f"{recording_path}: no capture with a colour image{named}")
     pictures.draw_views(png, rows)
     console.print(f"{png}: {len(rows)} captures")
 

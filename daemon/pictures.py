@@ -82,10 +82,9 @@ def draw_map(path: Path, layers: Any, size_m: float, names: tuple[str, ...], cla
         class_rgb: (k, 3) their colours.
     """
     plt = _pyplot()
-    best = layers.p.argmax(axis=1)
+    label = layers.label()
     confidence = layers.p.max(axis=1)
-    known = np.asarray(layers.p).std(axis=1) > 1e-6
-    class_colour = np.where(known[:, None], class_rgb[best], _UNKNOWN)
+    class_colour = coloured(label, class_rgb)
     shades = plt.get_cmap("viridis")(confidence)[:, :3]
     eye = _eye_direction(layers.index, size_m)
     drawn = draw_voxels(layers.index, size_m, class_colour, eye)
@@ -96,19 +95,17 @@ def draw_map(path: Path, layers: Any, size_m: float, names: tuple[str, ...], cla
         ax.imshow(picture, interpolation="antialiased")
         ax.set_title(title)
         ax.axis("off")
-    counts = np.bincount(best[known], minlength=len(names))
+    counts = np.bincount(label, minlength=len(names) + 1)
     patches = [
         plt.matplotlib.patches.Patch(color=rgb / 255, label=f"{name}  {count:,}")
-        for name, rgb, count in zip(names, class_rgb, counts, strict=True)
+        for name, rgb, count in zip(names, class_rgb, counts[1:], strict=True)
     ]
-    if not known.all():
-        patches.append(
-            plt.matplotlib.patches.Patch(color=_UNKNOWN / 255, label=f"unknown  {np.sum(~known):,}")
-        )
+    if counts[0]:
+        patches.append(plt.matplotlib.patches.Patch(color=_UNKNOWN / 255, label=f"unknown  {counts[0]:,}"))
     figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), frameon=False)
     bar = plt.cm.ScalarMappable(cmap="viridis", norm=plt.Normalize(0, 1))
     figure.colorbar(bar, ax=axes[1], fraction=0.025)
-    figure.suptitle(f"{len(best):,} voxels of {size_m * 1000:g} mm, seen from the robot's side")
+    figure.suptitle(f"{len(label):,} voxels of {size_m * 1000:g} mm, seen from the robot's side")
     _save(figure, path)
 
 

@@ -152,6 +152,8 @@ def build_pipeline(config: Config) -> Pipeline:
     """
     rig = rig_of(config)[1]
     model = Model.from_bytes(_read(config.model, "model"), str(config.model))
+    if config.replay is not None:
+        model.check(rig, Recording.open(config.replay).classes)
     return Pipeline(rig, model, PipelineSettings(config.pipeline.update, config.pipeline.pool))
 
 

@@ -13,7 +13,7 @@ from surfclass.errors import InputError
 from surfclass.frames import Capture
 from surfclass.kinematics import depth_pose
 from surfclass.pipeline import Pipeline
-from surfclass.pooling import Pool, fuse
+from surfclass.pooling import Pool, fuse, is_known
 from surfclass.rig import ColourFeature, Rig
 from surfclass.types import Bool, Float32, Float64, Int32, Observation
 from surfclass.viewing import view_surface
@@ -242,8 +242,8 @@ def benchmark_of(
 
 
 def _label(capture: Capture) -> NDArray[np.uint8]:
-    if capture.label is None or not capture.label.any():
-        raise InputError(f"capture {capture.name}: role 'test', but it has no label")
+    if capture.label is None:
+        raise InputError(f"capture {capture.name}: role 'test', but it has no label image")
     return capture.label
 
 
@@ -259,7 +259,7 @@ def score_layers(layers: MapLayers, route: str, truth: NDArray[np.intp]) -> Scor
     """
     by_route = {"texture": layers.p_texture, "combined": layers.p}
     p = by_route.get(route, layers.p_colour)
-    return score(truth, p, p.max(axis=1) > 1 / p.shape[1] + 1e-6)
+    return score(truth, p, is_known(p))
 
 
 def _score_pixels(

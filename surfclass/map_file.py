@@ -41,12 +41,14 @@ class MapFile:
     Attributes:
         voxel_size_m: Side of a voxel.
         classes: The class names in the order of the layers' columns.
+        colours: What each is drawn in, `#rrggbb`; None where the file does not say.
         layers: The voxels, sorted by index.
     """
 
     voxel_size_m: float
     classes: tuple[str, ...]
     layers: MapLayers
+    colours: tuple[str, ...] | None = None
 
     def at(self, index: Int32) -> MapLayers:
         """Returns the layers of the voxels asked for, (n, 3), in that order; uniform where there is none."""
@@ -73,7 +75,7 @@ class MapFile:
 def to_npz_bytes(voxels: VoxelMap, pool: Pool = "log-linear") -> bytes:
     """Returns the map as an `.npz` without pickles; the same map gives the same bytes.
 
-    Its arrays are `voxel_size_m` (), `classes` (k,) text, `index` (n, 3) int32, `p_colour`,
+    Its arrays are `voxel_size_m` (), `classes` and `colours` (k,) text, `index` (n, 3) int32, `p_colour`,
     `p_texture`, `p` (n, k) float32, `weight` (n,) float32 and `count` (n,) int32.
 
     Raises:
@@ -83,6 +85,7 @@ def to_npz_bytes(voxels: VoxelMap, pool: Pool = "log-linear") -> bytes:
     arrays: dict[str, NDArray[Any]] = {
         "voxel_size_m": np.array(voxels.size_m),
         "classes": np.array(voxels.classes.names),
+        "colours": np.array(voxels.classes.colours),
         **{name: getattr(layers, name) for name in _ARRAYS[2:]},
     }
     file = io.BytesIO()
@@ -110,7 +113,7 @@ def from_npz_bytes(data: bytes, source: str) -> MapFile:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise InputError(f"{source}: not a map file (a single array)")
-            arrays = {name: archive[name] for name in _ARRAYS if name in archive}
+            arrays = {name: archive[name] for name in (*_ARRAYS, "colours") if name in archive}
     except InputError:
         raise
     except _DAMAGED as error:
@@ -141,7 +144,15 @@ def from_npz_bytes(data: bytes, source: str) -> MapFile:
         raise InputError(
             f"{source}: voxel_size_m is {size_m:g} and there are {k} classes; both must be positive"
         )
+    colours = arrays.get("colours")
+    if colours is not None and (colours.shape != (k,) or not np.issubdtype(colours.dtype, np.str_)):
+        raise InputError(
+            f"{source}: colours is {colours.dtype} of shape {colours.shape}, needs str_ of ({k},)"
+        )
     layers: dict[str, Float32] = {name: arrays[name] for name in ("p_colour", "p_texture", "p", "weight")}
     return MapFile(
-        size_m, tuple(str(name) for name in names), MapLayers(index=index, count=arrays["count"], **layers)
+        size_m,
+        tuple(str(name) for name in names),
+        MapLayers(index=index, count=arrays["count"], **layers),
+        None if colours is None else tuple(str(colour) for colour in colours),
     )

@@ -130,7 +130,12 @@ class Pipeline:
         Raises:
             InputError, MissingCalibrationError: As `process`.
         """
-        clock = clock or StageClock()
+        with naming(capture):
+            return self._classify(capture, features, clock or StageClock())
+
+    def _classify(
+        self, capture: Capture, features: tuple[ColourFeature, ...], clock: StageClock
+    ) -> Classified:
         self.rig.check(capture)
         image = lit_image(capture, self.rig)
         exposure_s = None if capture.colour is None else capture.colour.exposure_s
@@ -177,6 +182,17 @@ class Pipeline:
         return Observation(
             point, likelihood, rows.take(cell, axis=0, mode="wrap"), has_colour, has_texture, weight
         )
+
+
+@contextmanager
+def naming(capture: Capture) -> Iterator[None]:
+    """Puts the capture's name before the message of an InputError that does not have it yet."""
+    try:
+        yield
+    except InputError as error:
+        if capture.name in str(error):
+            raise
+        raise type(error)(f"capture {capture.name}: {error}") from None
 
 
 def lit_image(capture: Capture, rig: Rig) -> Image:

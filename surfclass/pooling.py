@@ -23,6 +23,16 @@ def softmax(log: Float32) -> Float32:
     return p
 
 
+def is_known(p: Float32) -> Bool:
+    """Returns where distributions (…, k) say anything: a uniform one names no class.
+
+    A voxel can have been seen and still be unknown: by pixels that no route could use, or by texture
+    whose weight was 0.
+    """
+    known: Bool = p.max(axis=-1) > 1 / p.shape[-1] + 1e-6
+    return known
+
+
 def fuse(
     colour: Float32,
     texture: Float32,

@@ -78,7 +78,7 @@ class ColourRoute:
     Attributes:
         feature: What it was trained on.
         reflectance: How its K_d was computed; without meaning for other features.
-        exposure_s: Exposure of its training images, where it was known and the same for all.
+        exposure_s: Exposure of its first training image, which K_d is scaled to; None: not known.
         classifier: The exact classifier.
         table: Its posteriors tabulated, which is what frames are classified with; None for a
             classifier that is evaluated directly.

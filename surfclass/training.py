@@ -16,7 +16,7 @@ from surfclass.colour import as_fraction
 from surfclass.errors import InputError, MissingCalibrationError
 from surfclass.frames import Capture
 from surfclass.model import Model, with_polynomial
-from surfclass.pipeline import lit_image
+from surfclass.pipeline import lit_image, naming
 from surfclass.rig import ColourFeature, Rig, SurfaceClasses
 from surfclass.routes import (
     Classifier,
@@ -118,24 +118,34 @@ def train(
     mode = _reflectance_mode(rig, settings, note)
     fitted = None
     if mode == "thesis" and (rig.response is None or rig.response.a2_a1_a0 is None):
-        fitted = fit_response(response_captures, rig)
-        note("fitted the polynomial of Eq. 4.4 to the response captures")
-        rig = with_polynomial(rig, fitted)
+        try:
+            fitted = fit_response(response_captures, rig)
+        except MissingCalibrationError as error:
+            if rig.features.colour == "K_d":
+                raise
+            note(f"the K_d route is left out: {error}")
+            mode = None
+        else:
+            note("fitted the polynomial of Eq. 4.4 to the response captures")
+            rig = with_polynomial(rig, fitted)
     features: list[ColourFeature] = ["RGB", "a*b*"] if mode is None else ["RGB", "a*b*", "K_d"]
 
-    gathered = _gather(captures, features, rig, len(classes.names), mode or "thesis", settings)
+    gathered = _gather(captures, features, rig, len(classes.names), mode or "thesis", settings, note)
     rng = np.random.default_rng(settings.seed)
     colour: dict[ColourFeature, ColourRoute] = {}
     for feature in features:
         note(f"training the {feature} route")
         drawn = gathered.colour[feature].drawn(settings.pixels_per_class, rng)
-        _every_class_has_samples(drawn[1], classes, feature)
+        _every_class_has_samples(
+            drawn[1], classes, f"{feature} pixel (K_d needs a normal and a good exposure)"
+        )
         classifier = _fit(*drawn, "rbf", settings)
         table = _tabulate(classifier, drawn[0]) if isinstance(classifier, svm.Svm) else None
         colour[feature] = ColourRoute(feature, mode or "thesis", gathered.exposure_s, classifier, table)
     note(f"training the {rig.features.texture} route")
     drawn = gathered.texture.drawn(settings.windows_per_class, rng)
-    _every_class_has_samples(drawn[1], classes, rig.features.texture)
+    side = settings.window_px
+    _every_class_has_samples(drawn[1], classes, f"window of {side} × {side} px that is all of one label")
     texture = TextureRoute(rig.features.texture, settings.window_px, _fit(*drawn, "linear", settings))
     card = {
         "settings": asdict(settings),
@@ -164,20 +174,26 @@ def _gather(
     class_count: int,
     mode: ReflectanceMode,
     settings: TrainingSettings,
+    note: Note,
 ) -> _Gathered:
     rng = np.random.default_rng(settings.seed)
     gathered = _Gathered({feature: _Samples() for feature in features})
     for number, capture in enumerate(captures):
         rig.check(capture)
-        if capture.label is None or capture.colour is None or not capture.label.any():
+        if capture.label is None or capture.colour is None:
             raise InputError(f"capture {capture.name}: role 'train', but it has no labelled colour image")
-        if number == 0:
+        if not capture.label.any():
+            note(f"capture {capture.name}: nothing in it is labelled, so nothing is learnt from it")
+            continue
+        if not gathered.names:
             gathered.exposure_s = capture.colour.exposure_s
         gathered.names.append(capture.name)
-        view, image = view_surface(capture.depth.depth_mm, rig), lit_image(capture, rig)
+        with naming(capture):
+            view, image = view_surface(capture.depth.depth_mm, rig), lit_image(capture, rig)
         ratio = exposure_ratio(gathered.exposure_s, capture.colour.exposure_s)
         for feature, samples in gathered.colour.items():
-            values, valid = colour_features(feature, image, view, rig, mode, ratio)
+            with naming(capture):
+                values, valid = colour_features(feature, image, view, rig, mode, ratio)
             for label in range(class_count):
                 pixels = np.argwhere(valid & (capture.label == label + 1))
                 if len(pixels) > settings.pixels_per_class:
@@ -186,7 +202,7 @@ def _gather(
                 samples.add(values[:, row, col].T, label, _place(row, col, number, settings.place_px))
         _gather_windows(gathered.texture, image, capture.label, number, rig, class_count, settings)
     if not gathered.names:
-        raise InputError("there is no capture of role 'train' to train from")
+        raise InputError("there is no capture of role 'train' with a label to train from")
     return gathered
 
 
@@ -314,10 +330,7 @@ def _place(row: NDArray[Any], col: NDArray[Any], number: int, side: int) -> NDAr
     return place
 
 
-def _every_class_has_samples(labels: NDArray[np.intp], classes: SurfaceClasses, feature: str) -> None:
+def _every_class_has_samples(labels: NDArray[np.intp], classes: SurfaceClasses, what: str) -> None:
     lacking = [name for number, name in enumerate(classes.names) if not (labels == number).any()]
     if lacking:
-        raise InputError(
-            f"no usable {feature} sample of {', '.join(lacking)} in the training captures "
-            "(labelled, with depth where the feature needs it, well exposed)"
-        )
+        raise InputError(f"the training captures have no {what} of {', '.join(lacking)}")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surfclass.errors import ConfigurationError, InputError
-from surfclass.pooling import Pool, fuse, softmax
+from surfclass.pooling import Pool, fuse, is_known, softmax
 from surfclass.rig import SurfaceClasses
 from surfclass.types import Float32, Int32, MapUpdate, Observation
 from surfclass.voxel_evidence import Update, check_update, voxel_evidence
@@ -42,9 +42,9 @@ class MapLayers:
     count: Int32
 
     def label(self) -> NDArray[np.uint8]:
-        """(n,): 1 + the index of the most probable class (Eq. 3.10), 0 where never seen."""
+        """(n,): 1 + the index of the most probable class (Eq. 3.10), 0 where nothing is known."""
         best = self.p.argmax(axis=1).astype(np.uint8) + np.uint8(1)
-        return np.where(self.count > 0, best, np.uint8(0))
+        return np.where(is_known(self.p), best, np.uint8(0))
 
 
 class VoxelMap:

@@ -80,7 +80,7 @@ class TestReplay:
             found = {name: arrays[name] for name in arrays.files}
         n, k = len(found["index"]), len(CLASSES)
         assert set(found) == {
-            "voxel_size_m", "classes", "index", "p_colour", "p_texture", "p", "weight", "count"
+            "voxel_size_m", "classes", "colours", "index", "p_colour", "p_texture", "p", "weight", "count"
         }  # fmt: skip
         assert n > 1000
         assert found["voxel_size_m"] == 0.010
@@ -208,7 +208,7 @@ class TestShow:
         assert cv2.imread(str(tmp_path / "map.png")).std() > 10
         points, colours = read_ply(tmp_path / "map.ply")
         np.testing.assert_allclose(points, (found.layers.index + 0.5) * 0.010)
-        rusted = found.layers.p.argmax(axis=1) == 0
+        rusted = found.layers.label() == 1
         assert {tuple(colour) for colour in colours[rusted].tolist()} == {(0xB7, 0x41, 0x0E)}
         assert set(state_of(tmp_path)) == {path.relative_to(tmp_path) for path in tmp_path.iterdir()}
         assert sorted(path.name for path in tmp_path.iterdir()) == ["map.ply", "map.png"]

@@ -30,6 +30,7 @@ def test_the_file_has_the_arrays_that_are_promised_and_no_others() -> None:
     assert {name: (array.dtype.kind, array.shape) for name, array in arrays.items()} == {
         "voxel_size_m": ("f", ()),
         "classes": ("U", (K,)),
+        "colours": ("U", (K,)),
         "index": ("i", (n, 3)),
         "p_colour": ("f", (n, K)),
         "p_texture": ("f", (n, K)),
@@ -42,6 +43,18 @@ def test_the_file_has_the_arrays_that_are_promised_and_no_others() -> None:
     assert float(arrays["voxel_size_m"]) == SIZE_M
     assert arrays["classes"].tolist() == list(CLASSES.names)
     np.testing.assert_array_equal(arrays["p"], voxels.fused().p)
+
+
+def test_a_map_without_colours_is_read_too_and_wrong_ones_are_refused() -> None:
+    with np.load(io.BytesIO(to_npz_bytes(sample())), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    assert from_npz_bytes(to_npz_bytes(sample()), "map").colours == CLASSES.colours
+    without, wrong = io.BytesIO(), io.BytesIO()
+    np.savez(without, **{name: array for name, array in arrays.items() if name != "colours"})
+    assert from_npz_bytes(without.getvalue(), "map").colours is None
+    np.savez(wrong, **{**arrays, "colours": arrays["colours"][:-1]})
+    with pytest.raises(InputError, match="colours"):
+        from_npz_bytes(wrong.getvalue(), "map")
 
 
 def test_the_same_map_gives_the_same_bytes_whatever_its_history() -> None:

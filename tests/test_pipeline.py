@@ -189,6 +189,35 @@ def test_naive_bayes_rejects_what_it_never_saw(cell):
     assert pipeline.classify(views[0], ("a*b*",)).colour["a*b*"].rejected.mean() < 0.5
 
 
+def test_a_route_that_is_not_wanted_is_left_out(cell):
+    """With a light but no response nothing but K_d is missing, and the rig asks for another feature."""
+    rig, classes, boards, _ = cell
+    features = rig.features.model_copy(update={"colour": "a*b*"})
+    blind = rig.model_copy(update={"response": None, "features": features})
+    notes = []
+    model = train(boards, [], blind, classes, SMALL, notes.append)
+    assert list(model.colour) == ["RGB", "a*b*"]
+    assert any("K_d route is left out" in note for note in notes)
+
+
+def test_a_capture_with_nothing_labelled_counts_for_nothing(cell, model):
+    rig, classes, boards, views = cell
+    blank = dataclasses.replace(views[0], name="blank", label=np.zeros_like(views[0].label))
+    with_blank = evaluate([blank, views[1]], Pipeline(rig, model), ["kd"])
+    alone = evaluate([views[1]], Pipeline(rig, model), ["kd"])
+    assert with_blank["routes"]["kd"]["views"]["blank"]["overall"] is None
+    assert with_blank["routes"]["kd"]["pixels"]["blank"]["pixels"] == 0
+    found = with_blank["routes"]["kd"]["views"][views[1].name]
+    assert found == alone["routes"]["kd"]["views"][views[1].name]
+    blank_board = dataclasses.replace(boards[0], name="blank", label=np.zeros_like(boards[0].label))
+    notes = []
+    again = train([blank_board, *boards], [], rig, classes, SMALL, notes.append)
+    assert again.card["captures"] == model.card["captures"]
+    assert any("blank" in note for note in notes)
+    with pytest.raises(InputError, match="labelled surface point"):
+        evaluate([blank], Pipeline(rig, model), ["kd"])
+
+
 class TestRefusals:
     def test_a_depth_image_of_the_wrong_size(self, cell, model):
         rig, _, _, views = cell
@@ -238,8 +267,15 @@ class TestRefusals:
 
     def test_no_training_capture(self, cell):
         rig, classes, *_ = cell
-        with pytest.raises(InputError, match="no capture of role 'train'"):
+        with pytest.raises(InputError, match="no capture of role 'train' with a label"):
             train([], [], rig, classes, SMALL)
+
+    def test_the_capture_is_named(self, cell, model):
+        rig, _, _, views = cell
+        dark = dataclasses.replace(views[0], dark=views[0].colour)
+        pipeline = Pipeline(rig.model_copy(update={"response": None}), model)
+        with pytest.raises(InputError, match=r"capture view_0: .*response\.inverse"):
+            pipeline.process(dark)
 
     def test_a_class_without_samples(self, cell):
         rig, classes, boards, _ = cell

@@ -275,6 +275,17 @@ def test_the_weight_enters_once() -> None:
     np.testing.assert_allclose(p[0], p[1], rtol=1e-5)
 
 
+def test_a_voxel_that_was_seen_but_says_nothing_has_no_label() -> None:
+    """Texture whose weight is 0 counts as seen; its class is not guessed."""
+    voxels = VoxelMap(SIZE_M, CLASSES)
+    voxels.add(one_voxel(texture=sure_of(1, 0.9), weight=0.0), 0)
+    layers = voxels.fused()
+    assert layers.count.tolist() == [1]
+    assert layers.label().tolist() == [0]
+    voxels.add(one_voxel(sure_of(1, 0.9)), 1)
+    assert voxels.fused().label().tolist() == [2]
+
+
 def test_softmax_is_shift_free_and_never_zero() -> None:
     log = np.array([[0, -5000, -1], [1e6, 1e6 - 1, -1e6]], np.float32)
     p = softmax(log)
