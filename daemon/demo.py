@@ -59,7 +59,7 @@ def run_demo(out: Path, seed: int, viewpoints: int) -> int:
     offline.train_model(out / "train.mcap", out / "model.npz", TrainingSettings())
 
     console.rule(f"3  map the cell from {viewpoints} viewpoints: service and console in two processes")
-    recorded, stage_ms = _map_cell(out, seed, viewpoints)
+    recorded, stage_ms = _map_cell(out, world, viewpoints)
 
     console.rule("4  score the map against the simulation's truth")
     _label(recorded, out / "test.mcap", world)
@@ -113,7 +113,7 @@ def _truth_label(world: SimWorld, capture: Capture) -> NDArray[np.uint8]:
     return truth.label_image(world, capture.joints.q)
 
 
-def _map_cell(out: Path, seed: int, viewpoints: int) -> tuple[Path, dict[str, float]]:
+def _map_cell(out: Path, world: SimWorld, viewpoints: int) -> tuple[Path, dict[str, float]]:
     """Runs service and console until the console's map holds every viewpoint.
 
     Returns:
@@ -122,7 +122,9 @@ def _map_cell(out: Path, seed: int, viewpoints: int) -> tuple[Path, dict[str, fl
     with tempfile.TemporaryDirectory(prefix="surfclass-") as sockets:
         endpoint = f"unixsock-stream/{sockets}/z"
         config = out / "service.toml"
-        write_atomically(config, _CONFIG.format(seed=seed, viewpoints=viewpoints, endpoint=endpoint).encode())
+        write_atomically(
+            config, _CONFIG.format(seed=world.seed, viewpoints=viewpoints, endpoint=endpoint).encode()
+        )
         watch = ["watch", "--connect", endpoint, "--robot", "demo", "--captures", str(viewpoints)]
         watch += ["--timeout-s", str(_WAIT_S), "--map", str(out / "console.npz")]
         watch += ["--json", str(out / "console.json")]
@@ -131,25 +133,31 @@ def _map_cell(out: Path, seed: int, viewpoints: int) -> tuple[Path, dict[str, fl
             _process(out / "console.log", watch) as watcher,
             console.status("the arm visits the cell"),
         ):
-            _wait(watcher, service, out)
+            _wait(watcher, service, out, world)
             service.send_signal(signal.SIGTERM)
             service.wait(_STOP_S)
     (recording,) = (out / "recordings").glob("*.mcap")
     return recording, json.loads((out / "console.json").read_text())["status"]["stage_ms"]
 
 
-def _wait(watcher: subprocess.Popen[bytes], service: subprocess.Popen[bytes], out: Path) -> None:
-    """Returns when the console has its map.
+def _wait(
+    watcher: subprocess.Popen[bytes], service: subprocess.Popen[bytes], out: Path, world: SimWorld
+) -> None:
+    """Returns when the console has its map; meanwhile the world's textures are made, for the scoring.
 
     Raises:
         InputError: If either process ends badly; the message ends with what it said last.
     """
+    surfaces = list(range(len(world.renderer.surfaces)))
     while watcher.poll() is None:
         if service.poll() is not None:
             raise InputError(
                 f"the service ended with {service.returncode}: {_last_words(out / 'daemon.log')}"
             )
-        time.sleep(0.2)
+        if surfaces:
+            world.texture(surfaces.pop(0))
+        else:
+            time.sleep(0.2)
     if watcher.returncode != 0:
         raise InputError(f"the console ended with {watcher.returncode}: {_last_words(out / 'console.log')}")
 
