@@ -270,7 +270,7 @@ def load_config(path: Path | None, overrides: Iterable[str] = (), replay: Path |
     data: dict[str, Any] = {}
     if path is not None:
         try:
-            data = tomllib.loads(path.read_bytes().decode())
+            data = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
         except OSError as error:
             raise ConfigurationError(f"{path}: cannot be read ({error.strerror})") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -45,13 +45,14 @@ def validate(table: type[T], data: Mapping[str, Any], source: str) -> T:
 
 
 def load_toml(text: str | bytes, source: str) -> dict[str, Any]:
-    """Returns what the TOML `text` says; a syntax error names its line.
+    """Returns what the TOML `text` says, with or without a byte order mark; a syntax error names its line.
 
     Raises:
         ConfigurationError: Where the text is not UTF-8 or not TOML.
     """
     try:
-        return tomllib.loads(text.decode() if isinstance(text, bytes) else text)
+        decoded = text.decode() if isinstance(text, bytes) else text
+        return tomllib.loads(decoded.removeprefix("\ufeff"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{source}: not a TOML file: {error}") from None
 

@@ -42,6 +42,13 @@ def test_example_is_valid_and_its_comments_are_the_defaults():
     assert Config.model_validate(full) == Config.model_validate(base)
 
 
+def test_byte_order_mark_changes_nothing(file):
+    path = file()
+    plain = load_config(path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert load_config(path) == plain
+
+
 def test_paths_start_at_the_file(file, tmp_path):
     config = load_config(file(SMALL.replace("[colour]", '[recording]\ndirectory = "rec"\n[colour]', 1)))
     assert config.rig == tmp_path / "rig.toml"
