@@ -99,7 +99,7 @@ def diffuse_reflectance(
     if fraction.shape != (3, *view.has_point.shape):
         raise InputError(f"K_d: planes {fraction.shape} for a view of {view.has_point.shape} pixels")
     if rig.light is None or view.light_distance_m is None or view.light_cosine is None:
-        raise _missing(rig, "light.position_rgb_m", "the light calibration")
+        raise _missing(rig, "light.position_rgb_m")
     d, cosine = view.light_distance_m, view.light_cosine
     valid: Bool = view.has_normal & (cosine >= LEAST_LIGHT_COSINE) & well_exposed(fraction)
     if mode == "thesis":
@@ -126,13 +126,16 @@ def lacking_for_full_model(rig: Rig) -> list[str]:
     return [key for key, value in needed.items() if value is None]
 
 
-def _missing(rig: Rig, what: str, how: str) -> MissingCalibrationError:
-    return MissingCalibrationError(f"rig {rig.name}: {what} is missing, K_d needs it; run {how}")
+def _missing(rig: Rig, *keys: str) -> MissingCalibrationError:
+    are_missing, them = ("is missing", "it") if len(keys) == 1 else ("are missing", "them")
+    return MissingCalibrationError(
+        f"rig {rig.name}: {' and '.join(keys)} {are_missing}, K_d needs {them}; add {them} to rig.toml"
+    )
 
 
 def _by_polynomial(fraction: Float32, d: Float32, cosine: Float32, valid: Bool, rig: Rig) -> Float32:
     if rig.response is None or rig.response.a2_a1_a0 is None:
-        raise _missing(rig, "response.a2_a1_a0", "the response calibration")
+        raise _missing(rig, "response.a2_a1_a0")
     inverse = np.divide(1, cosine, out=np.zeros_like(cosine), where=valid)
     k_d = np.empty_like(fraction)
     for channel, polynomial in enumerate(rig.response.a2_a1_a0):
@@ -156,12 +159,12 @@ def _by_full_model(
     exposure_ratio: float,
 ) -> Float32:
     if rig.response is None or rig.response.inverse is None:
-        raise _missing(rig, "response.inverse", "the response calibration with an exposure series")
+        raise _missing(rig, "response.inverse")
     if rig.rgb.vignetting is None:
-        raise _missing(rig, "rgb.vignetting", "the light calibration")
+        raise _missing(rig, "rgb.vignetting")
     light = rig.light
     if light is None or light.axis_rgb is None or light.falloff_exponent is None:
-        raise _missing(rig, "light.axis_rgb and light.falloff_exponent", "the light calibration")
+        raise _missing(rig, "light.axis_rgb", "light.falloff_exponent")
     emission, shines = _emission(view.point, d, light)
     valid &= shines
     emission *= cosine
@@ -225,37 +228,49 @@ def subtract_dark(
 
     Args:
         lit: (h, w, 3) uint8 or uint16, the LED on.
-        dark: The same view and exposure, the LED off.
+        dark: The same view and exposure, the LED off; uint8 or uint16, whichever `lit` is.
         response: The camera's; its `inverse` is needed.
+
+    Returns:
+        (h, w, 3) of `lit`'s type.
 
     Raises:
         MissingCalibrationError: If `response.inverse` is missing.
-        InputError: If the images differ in shape or type.
+        InputError: If the images differ in shape, or have another type.
     """
     if response is None or response.inverse is None:
         raise MissingCalibrationError(
-            "response.inverse is missing: an unlit frame can be taken off in linear light only; run the "
-            "response calibration with an exposure series"
+            "response.inverse is missing: the dark frame cannot be subtracted without it, for light adds up "
+            "before the camera's response; add it to rig.toml, or leave the dark frames out"
         )
-    if lit.shape != dark.shape or lit.dtype != dark.dtype or lit.dtype not in (np.uint8, np.uint16):
+    if lit.shape != dark.shape or not {lit.dtype, dark.dtype} <= {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise InputError(
             f"dark image: {dark.dtype} {dark.shape}, the lit one is {lit.dtype} {lit.shape}; "
-            "allowed is the same shape and type, uint8 or uint16"
+            "allowed is the same shape, each uint8 or uint16"
         )
-    full = np.iinfo(lit.dtype).max
-    levels = np.linspace(0, 1, full + 1)
+    levels = np.arange(np.iinfo(lit.dtype).max + 1, dtype=lit.dtype)
+    dark_levels = np.arange(np.iinfo(dark.dtype).max + 1, dtype=dark.dtype)
     result = np.empty_like(lit)
     for channel, curve in enumerate(response.inverse):
-        linear = _linear(levels, curve)
-        knots = np.linspace(0, 1, len(curve))
-        if lit.dtype == np.uint8:
-            left = np.maximum(linear[:, None] - linear[None, :], 0)
-            table = np.rint(np.interp(left, curve, knots) * full).astype(lit.dtype)
-            table[levels >= OVER_EXPOSED] = np.nonzero(levels >= OVER_EXPOSED)[0][:, None]
-            result[..., channel] = table[lit[..., channel], dark[..., channel]]
+        image, unlit = lit[..., channel], dark[..., channel]
+        if levels.size == dark_levels.size == 256:  # few enough pairs to have each ready
+            table = _without_dark(levels[:, None], dark_levels[None, :], curve)
+            result[..., channel] = table[image, unlit]
         else:
-            left = np.maximum(linear[lit[..., channel]] - linear[dark[..., channel]], 0)
-            taken_off = np.rint(np.interp(left, curve, knots) * full).astype(lit.dtype)
-            saturated = lit[..., channel] >= OVER_EXPOSED * full
-            result[..., channel] = np.where(saturated, lit[..., channel], taken_off)
+            result[..., channel] = _without_dark(image, unlit, curve)
     return result
+
+
+def _without_dark(lit: NDArray[Any], dark: NDArray[Any], curve: tuple[float, ...]) -> NDArray[Any]:
+    """One channel of `subtract_dark`, in the type of `lit`; the shapes broadcast."""
+    full = np.iinfo(lit.dtype).max
+    left = np.maximum(_irradiance(lit, curve) - _irradiance(dark, curve), 0)
+    taken_off = np.rint(np.interp(left, curve, np.linspace(0, 1, len(curve))) * full).astype(lit.dtype)
+    return np.where(lit >= OVER_EXPOSED * full, lit, taken_off)
+
+
+def _irradiance(image: NDArray[Any], curve: tuple[float, ...]) -> Float64:
+    """g⁻¹ of an image of integers, whatever their full scale."""
+    full = np.iinfo(image.dtype).max
+    linear: Float64 = _linear(np.linspace(0, 1, full + 1), curve)[image]
+    return linear
