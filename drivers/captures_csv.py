@@ -64,7 +64,7 @@ def read_captures_csv(path: Path) -> tuple[Row, ...]:
     try:
         _check_header(path, next(reader, []))
         for fields in reader:
-            if not any(fields):
+            if not any(field.strip() for field in fields):
                 continue
             where = f"{path}, line {reader.line_num}"
             if len(fields) != len(COLUMNS):

@@ -15,7 +15,7 @@ from drivers.images import check_pixels, decode_image
 from drivers.plate import Plate, parse_plate
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
-from surfclass.rig import DepthRig, Rig, SurfaceClasses, parse_classes, parse_depth_rig, parse_rig
+from surfclass.rig import DepthRig, Rig, SurfaceClasses, parse_classes, parse_depth_rig
 
 # Channels and bits that each kind of image may have.
 _PIXELS = {
@@ -36,7 +36,7 @@ class FolderSet:
     Attributes:
         path: The folder.
         rig_text: `rig.toml` as it stands.
-        depth_rig: What it says; a `Rig` unless the set has no colour camera.
+        depth_rig: What it says; a `Rig` unless it leaves out the colour camera or where that is.
         classes_text: `classes.toml` as it stands, or None.
         classes: What it says, or None.
         plate_text: `plate.toml` as it stands, or None.
@@ -60,7 +60,7 @@ class FolderSet:
         """The whole sensor package.
 
         Raises:
-            MissingCalibrationError: Where the set has no colour camera.
+            MissingCalibrationError: Where it leaves out the colour camera or where that is.
         """
         return self.depth_rig.whole()
 
@@ -74,20 +74,21 @@ class FolderSet:
             InputError: Naming the file and what is allowed, for a damaged image, a wrong pixel type
                 or size, and a label above the number of classes.
         """
+        depth, rgb = self.depth_rig.depth, self.depth_rig.rgb
+        in_depth = depth.shape, "rig.toml says"
+        in_colour = None if rgb is None else (rgb.shape, "rig.toml says")
         for sequence, (row, files) in enumerate(zip(self.rows, self.files, strict=True)):
             encoded = {kind: _read_bytes(path) for kind, path in files.items()}
             images = {kind: self._image(kind, path, encoded[kind]) for kind, path in files.items()}
+            for kind, image in images.items():
+                if kind not in ("depth", "ir") and in_colour is None:  # still one camera, whichever it is
+                    in_colour = image.shape[:2], f"rig.toml has no [rgb], and {files[kind]} is"
+                _check_size(image, in_depth if kind in ("depth", "ir") else in_colour, files[kind])
             yield _capture(sequence, row, images), encoded
 
     def _image(self, kind: str, path: Path, data: bytes) -> NDArray[Any]:
         image = decode_image(data, str(path))
         check_pixels(image, *_PIXELS[kind], str(path))
-        camera = self.depth_rig.depth if kind in ("depth", "ir") else self.rig.rgb
-        if image.shape[:2] != camera.shape:
-            raise InputError(
-                f"{path}: {image.shape[1]} × {image.shape[0]} pixels, rig.toml says "
-                f"{camera.size[0]} × {camera.size[1]}"
-            )
         if kind == "label" and self.classes is not None:
             _check_label(image, len(self.classes.names), path)
         return image
@@ -106,9 +107,6 @@ def read_folder(directory: str | Path) -> FolderSet:
     rows = read_captures_csv(folder / "captures.csv")
     files = tuple(_find_files(folder, row) for row in rows)
     roles = {row.role for row in rows}
-    colourless = roles == {"hand_eye"} and not any(
-        {"colour", "dark", "label"} & found.keys() for found in files
-    )
     rig_path = folder / "rig.toml"
     rig_text = _read_text(rig_path, "every data folder has one")
     needs_classes = "label" in {kind for found in files for kind in found} or roles & _NEED_CLASSES
@@ -120,7 +118,7 @@ def read_folder(directory: str | Path) -> FolderSet:
     return FolderSet(
         path=folder,
         rig_text=rig_text,
-        depth_rig=(parse_depth_rig if colourless else parse_rig)(rig_text, str(rig_path)),
+        depth_rig=parse_depth_rig(rig_text, str(rig_path)),
         classes_text=classes_text,
         classes=None if classes_text is None else parse_classes(classes_text, str(folder / "classes.toml")),
         plate_text=plate_text,
@@ -168,6 +166,12 @@ def _capture(sequence: int, row: Row, images: dict[str, NDArray[Any]]) -> Captur
         base_T_depth=row.base_T_depth,
         label=images.get("label"),
     )
+
+
+def _check_size(image: NDArray[Any], stated: tuple[tuple[int, ...], str] | None, path: Path) -> None:
+    if stated is not None and image.shape[:2] != stated[0]:
+        (height, width), says = stated
+        raise InputError(f"{path}: {image.shape[1]} × {image.shape[0]} pixels, {says} {width} × {height}")
 
 
 def _check_label(label: NDArray[Any], count: int, path: Path) -> None:

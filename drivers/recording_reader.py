@@ -59,7 +59,7 @@ class Recording:
     Attributes:
         path: The file.
         rig_text: `rig.toml` as it was.
-        depth_rig: What it says; a `Rig` unless the set has no colour camera.
+        depth_rig: What it says; a `Rig` unless it leaves out the colour camera or where that is.
         classes_text: `classes.toml` as it was, or None.
         classes: What it says, or None.
         plate_text: `plate.toml` as it was, or None.
@@ -126,7 +126,7 @@ class Recording:
         """The whole sensor package.
 
         Raises:
-            MissingCalibrationError: Where the set has no colour camera.
+            MissingCalibrationError: Where it leaves out the colour camera or where that is.
         """
         return self.depth_rig.whole()
 

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from surfclass.errors import InputError, MissingCalibrationError
 from surfclass.frames import Capture
-from surfclass.schema import Number, Positive, Table, Vector3, load_toml, parse_toml, validate
+from surfclass.schema import Number, Positive, Table, Vector3, parse_toml
 from surfclass.types import Float64, Transform
 
 SCHEMA = 1
@@ -67,7 +67,7 @@ class KnownTransforms(Table):
 
 
 class Transforms(KnownTransforms):
-    """Rigid transforms of a package with a colour camera."""
+    """Rigid transforms of a whole package."""
 
     rgb_T_depth: Matrix4
 
@@ -157,12 +157,16 @@ class Arm(Table):
 
 
 class DepthRig(Table):
-    """A sensor package whose colour camera need not be known: enough for a set without colour."""
+    """A sensor package as far as it is known: enough for a set without colour, or to calibrate from.
+
+    What a table leaves out is None, and what needs it refuses with MissingCalibrationError.
+    """
 
     schema_version: Annotated[int, Field(alias="schema")]
     name: str
     voxel_size_m: Positive
     depth: Camera
+    rgb: Camera | None = None
     transforms: KnownTransforms = KnownTransforms()
     light: Light | None = None
     response: Response | None = None
@@ -180,6 +184,17 @@ class DepthRig(Table):
         return version
 
     @cached_property
+    def rgb_T_depth(self) -> Transform:
+        """The depth camera in the colour camera's frame.
+
+        Raises:
+            MissingCalibrationError: If the rig has none.
+        """
+        if self.transforms.rgb_T_depth is None:
+            raise self._lacks("transforms.rgb_T_depth")
+        return Transform("rgb", "depth", np.array(self.transforms.rgb_T_depth))
+
+    @cached_property
     def flange_T_depth(self) -> Transform:
         """The hand-eye transform.
 
@@ -189,68 +204,68 @@ class DepthRig(Table):
         if self.transforms.flange_T_depth is None:
             raise MissingCalibrationError(
                 f"rig {self.name}: transforms.flange_T_depth is missing, and the captures give only "
-                "joint angles; run the hand-eye calibration, or give the captures their poses"
+                "joint angles; add it to rig.toml, or give the captures their poses"
             )
         return Transform("flange", "depth", np.array(self.transforms.flange_T_depth))
 
     def check(self, capture: Capture) -> None:
-        """Raises InputError where an image of the capture has not the size that the rig states."""
-        colour, dark = capture.colour, capture.dark
-        images = [
-            ("depth image", capture.depth.depth_mm, self.depth),
-            ("IR image", capture.depth.ir, self.depth),
-            ("colour image", None if colour is None else colour.rgb, self._colour_camera),
-            ("dark image", None if dark is None else dark.rgb, self._colour_camera),
-            ("label image", capture.label, self._colour_camera),
-        ]
-        for what, image, camera in images:
-            if image is None:
-                continue
-            if camera is None:
-                raise InputError(f"capture {capture.name}: a {what}, but rig {self.name} has no [rgb]")
-            if image.shape[:2] != camera.shape:
-                raise InputError(
-                    f"capture {capture.name}: {what} is {image.shape[1]} × {image.shape[0]}, "
-                    f"rig {self.name} says {camera.size[0]} × {camera.size[1]}"
-                )
+        """Raises InputError where an image of the capture has not the size that the rig states.
+
+        Where the rig has no [rgb], the images in the colour camera's grid must have one size.
+        """
+        in_depth = {"depth image": capture.depth.depth_mm, "IR image": capture.depth.ir}
+        in_colour = {
+            "colour image": None if capture.colour is None else capture.colour.rgb,
+            "dark image": None if capture.dark is None else capture.dark.rgb,
+            "label image": capture.label,
+        }
+        for images, camera in ((in_depth, self.depth), (in_colour, self.rgb)):
+            found = {what: image.shape[:2] for what, image in images.items() if image is not None}
+            if camera is not None:
+                shape, says = camera.shape, f"rig {self.name} says"
+            elif found:
+                first = next(iter(found))
+                shape, says = found[first], f"its {first} is"
+            for what, (height, width) in found.items():
+                if (height, width) != shape:
+                    raise InputError(
+                        f"capture {capture.name}: {what} is {width} × {height}, "
+                        f"{says} {shape[1]} × {shape[0]}"
+                    )
 
     def whole(self) -> Rig:
-        """Returns the rig with its colour camera.
+        """Returns the rig with its colour camera and where that is.
 
         Raises:
-            MissingCalibrationError: If it has none.
+            MissingCalibrationError: Naming what of both is missing.
         """
-        raise MissingCalibrationError(
-            f"rig {self.name}: [rgb] is missing, and this step needs the colour camera; run the camera "
-            "calibration, or add [rgb] and transforms.rgb_T_depth to rig.toml"
-        )
+        if self.missing:
+            raise self._lacks(*self.missing)
+        return Rig.model_validate(self.model_dump(by_alias=True, exclude_unset=True))
 
     @property
-    def _colour_camera(self) -> Camera | None:
-        return None
+    def missing(self) -> list[str]:
+        """The keys of `rig.toml` that a whole rig has and this one leaves out."""
+        needed = {"[rgb]": self.rgb, "transforms.rgb_T_depth": self.transforms.rgb_T_depth}
+        return [key for key, value in needed.items() if value is None]
+
+    def _lacks(self, *keys: str) -> MissingCalibrationError:
+        is_missing, it = ("is missing", "it") if len(keys) == 1 else ("are missing", "them")
+        return MissingCalibrationError(
+            f"rig {self.name}: {' and '.join(keys)} {is_missing}, and this step matches colour with depth; "
+            f"add {it} to rig.toml (a recording keeps the rig that it was made with: import its set again)"
+        )
 
 
 class Rig(DepthRig):
-    """The sensor package; read from `rig.toml`, whose text travels inside every recording.
-
-    What a table leaves out is None, and what needs it refuses with MissingCalibrationError.
-    """
+    """The whole sensor package; read from `rig.toml`, whose text travels inside every recording."""
 
     rgb: Camera
     transforms: Transforms
 
-    @cached_property
-    def rgb_T_depth(self) -> Transform:
-        """The depth camera in the colour camera's frame."""
-        return Transform("rgb", "depth", np.array(self.transforms.rgb_T_depth))
-
     def whole(self) -> Rig:
         """Returns itself."""
         return self
-
-    @property
-    def _colour_camera(self) -> Camera:
-        return self.rgb
 
 
 class SurfaceClasses(Table):
@@ -274,22 +289,23 @@ class SurfaceClasses(Table):
 
 
 def parse_rig(text: str | bytes, source: str) -> Rig:
-    """Returns the rig that `rig.toml`'s text describes.
+    """Returns the whole rig that `rig.toml`'s text describes.
+
+    Raises:
+        ConfigurationError: Naming every fault by its path, an unknown schema among them.
+        MissingCalibrationError: As `DepthRig.whole`.
+    """
+    return parse_depth_rig(text, source).whole()
+
+
+def parse_depth_rig(text: str | bytes, source: str) -> DepthRig:
+    """Returns a Rig, or a DepthRig where the text leaves out [rgb] or `transforms.rgb_T_depth`.
 
     Raises:
         ConfigurationError: Naming every fault by its path, an unknown schema among them.
     """
-    return parse_toml(Rig, text, source)
-
-
-def parse_depth_rig(text: str | bytes, source: str) -> DepthRig:
-    """Returns a Rig, or a DepthRig where the text has no [rgb] table.
-
-    Raises:
-        ConfigurationError: As `parse_rig`.
-    """
-    data = load_toml(text, source)
-    return validate(Rig if "rgb" in data else DepthRig, data, source)
+    known = parse_toml(DepthRig, text, source)
+    return known if known.missing else known.whole()
 
 
 def parse_classes(text: str | bytes, source: str) -> SurfaceClasses:

@@ -162,9 +162,9 @@ FAULTS: dict[str, tuple[Fault, str]] = {
         text("rig.toml", "voxel_size_m", "voxel_size"),
         r"rig\.toml:(?s:.*)did you mean 'voxel_size_m'",
     ),
-    "rig without rgb": (
-        lambda f: (f / "rig.toml").write_text(DEPTH_ONLY_TOML),
-        r"rig\.toml:(?s:.*)rgb: missing",
+    "rgb without size": (
+        text("rig.toml", f"size = [{WIDTH}, {HEIGHT}]", ""),
+        r"rig\.toml:\s+rgb\.size: missing",
     ),
     "rig not toml": (
         lambda f: (f / "rig.toml").write_text("schema = = 1"),
@@ -292,8 +292,59 @@ def test_reflector_discs_need_neither_colour_nor_classes(tmp_path: Path) -> None
     assert found.plate is not None
     assert found.plate.positions_base_m[1] == (1.0, 0.1, 0.5)
     assert type(found.depth_rig) is DepthRig
-    with pytest.raises(MissingCalibrationError, match=r"\[rgb\] is missing"):
+    with pytest.raises(MissingCalibrationError, match=r"\[rgb\] and transforms\.rgb_T_depth are missing"):
         _ = found.rig
+
+
+NO_TRANSFORMS = RIG_TOML.split("[transforms]")[0]
+
+
+@pytest.mark.parametrize("role", ["hand_eye", "board"])
+@pytest.mark.parametrize(
+    ("rig", "missing"),
+    [
+        (NO_TRANSFORMS, r"transforms\.rgb_T_depth is missing"),
+        (f"{NO_TRANSFORMS}[transforms]\n", r"transforms\.rgb_T_depth is missing"),
+        (DEPTH_ONLY_TOML, r"\[rgb\] and transforms\.rgb_T_depth are missing"),
+    ],
+)
+def test_what_is_to_be_calibrated_may_be_left_out(tmp_path: Path, role: str, rig: str, missing: str) -> None:
+    one = capture(0, role=role, label=None, base_T_depth=None)
+    folder = write_folder(tmp_path / "set", [one])
+    (folder / "rig.toml").write_text(rig)
+    (folder / "plate.toml").write_text(PLATE_TOML)
+    found = read_folder(folder)
+    assert_same(next(found.captures())[0], as_imported(one, 0))
+    with pytest.raises(MissingCalibrationError, match=f"rig bench: {missing}.*to rig.toml"):
+        _ = found.rig
+
+
+@pytest.mark.parametrize("kind", ["colour", "dark", "label"])
+def test_an_unknown_colour_camera_is_still_one_camera(folder: Path, kind: str) -> None:
+    (folder / "rig.toml").write_text(DEPTH_ONLY_TOML)
+    assert len(read_all(folder)) == 2
+    shape = (8, 6) if kind == "label" else (8, 6, 3)
+    write_image(folder / kind / "c001.png", np.zeros(shape, np.uint8))
+    says = rf"{kind}/c001\.png: 6 × 8 pixels, rig\.toml has no \[rgb\], and .*colour/c000\.png is 8 × 6"
+    with pytest.raises(InputError, match=says):
+        read_all(folder)
+
+
+@pytest.mark.parametrize("name", ["rig.toml", "classes.toml", "plate.toml", "captures.csv"])
+def test_a_byte_order_mark_changes_nothing(folder: Path, name: str) -> None:
+    (folder / "plate.toml").write_text(PLATE_TOML)
+    plain = read_folder(folder)
+    (folder / name).write_bytes(b"\xef\xbb\xbf" + (folder / name).read_bytes())
+    marked = read_folder(folder)
+    assert (marked.rig, marked.classes, marked.plate) == (plain.rig, plain.classes, plain.plate)
+    assert len(marked) == len(plain)
+
+
+@pytest.mark.parametrize("blank", ["  ", "\t\n \n", " , ,\n"])
+def test_lines_of_white_space_are_no_captures(folder: Path, blank: str) -> None:
+    with (folder / "captures.csv").open("a") as file:
+        file.write(blank)
+    assert len(read_folder(folder)) == 2
 
 
 def test_classes_may_be_missing_where_nothing_is_classified(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from surfclass.kinematics import (
     forward_kinematics,
     pose_difference,
 )
-from surfclass.rig import Rig, parse_rig
+from surfclass.rig import Rig, parse_depth_rig, parse_rig
 from surfclass.types import Transform
 
 # alpha°, a, d, theta offset° (Table 6.1)
@@ -189,10 +189,27 @@ def test_joints_and_pose_must_agree_in_direction():
 def test_pose_without_hand_eye():
     pose = dh_product(Q)
     assert depth_pose(capture(q=Q, pose=pose), rig(hand_eye=False)).matrix == pytest.approx(pose, abs=0)
-    with pytest.raises(MissingCalibrationError, match="flange_T_depth"):
+    with pytest.raises(MissingCalibrationError, match=r"flange_T_depth is missing.*; add it to rig\.toml"):
         depth_pose(capture(q=Q), rig(hand_eye=False))
     with pytest.raises(InputError, match="capture view: neither"):
         depth_pose(capture(), rig())
+
+
+def test_only_what_needs_the_colour_camera_refuses_where_it_is_unknown():
+    text = """
+        schema = 1
+        name = "test"
+        voxel_size_m = 0.01
+        depth = {size = [4, 3], fx = 4.0, fy = 4.0, cx = 1.5, cy = 1.0}
+    """
+    known = parse_depth_rig(text, "rig.toml")
+    assert depth_pose(capture(pose=dh_product(Q)), known).matrix == pytest.approx(dh_product(Q), abs=0)
+    with pytest.raises(MissingCalibrationError, match=r"rgb_T_depth is missing.*; add it to rig\.toml"):
+        _ = known.rgb_T_depth
+    with pytest.raises(MissingCalibrationError, match=r"\[rgb\] and transforms\.rgb_T_depth are missing"):
+        parse_rig(text, "rig.toml")
+    complete = known.model_copy(update={"rgb": rig().rgb, "transforms": rig().transforms})
+    assert complete.whole() == rig()
 
 
 def test_pose_difference_of_half_a_turn():

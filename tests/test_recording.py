@@ -114,12 +114,41 @@ def test_a_set_without_colour(tmp_path: Path) -> None:
     one = capture(0, role="hand_eye", colour=None, dark=None, label=None)
     with RecordingWriter(tmp_path / "a.mcap", DEPTH_ONLY_TOML, None, plate_text=PLATE_TOML) as writer:
         writer.write(one)
-        with pytest.raises(InputError, match=r"capture c001: a colour image, but rig bench has no \[rgb\]"):
-            writer.write(capture(1))
     found = Recording.open(tmp_path / "a.mcap")
     assert_same(next(found.captures()), one)
-    with pytest.raises(MissingCalibrationError, match=r"\[rgb\] is missing"):
+    with pytest.raises(MissingCalibrationError, match=r"\[rgb\] and transforms\.rgb_T_depth are missing"):
         _ = found.rig
+
+
+@pytest.mark.parametrize("rig", [DEPTH_ONLY_TOML, RIG_TOML.split("[transforms]")[0]])
+def test_a_set_to_calibrate_the_colour_camera_from(tmp_path: Path, rig: str) -> None:
+    some = [capture(seed, role="board") for seed in range(2)]
+    with RecordingWriter(tmp_path / "a.mcap", rig, CLASSES_TOML) as writer:
+        for one in some:
+            writer.write(one)
+    found = Recording.open(tmp_path / "a.mcap")
+    for one, other in zip(found.captures(), some, strict=True):
+        assert_same(one, other)
+    with pytest.raises(MissingCalibrationError, match=r"transforms\.rgb_T_depth"):
+        _ = found.rig
+
+
+def test_a_capture_of_an_unknown_colour_camera_has_one_size(tmp_path: Path) -> None:
+    one = capture(0, dark=ColourFrame(0, 0, None, np.zeros((WIDTH, HEIGHT, 3), np.uint8)))
+    with (
+        RecordingWriter(tmp_path / "a.mcap", DEPTH_ONLY_TOML, CLASSES_TOML) as writer,
+        pytest.raises(InputError, match="c000: dark image is 6 × 8, its colour image is 8 × 6"),
+    ):
+        writer.write(one)
+
+
+def test_texts_with_a_byte_order_mark_travel_as_they_stand(tmp_path: Path) -> None:
+    texts = ["\ufeff" + text for text in (RIG_TOML, CLASSES_TOML, PLATE_TOML)]
+    with RecordingWriter(tmp_path / "a.mcap", texts[0], texts[1], plate_text=texts[2]) as writer:
+        writer.write(capture(0))
+    found = Recording.open(tmp_path / "a.mcap")
+    assert [found.rig_text, found.classes_text, found.plate_text] == texts
+    assert found.rig.name == "bench"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
