@@ -196,7 +196,7 @@ class TestRecordings:
 
     def test_nothing_to_train_on(self, commissioned, refuses, tmp_path):
         rewritten(commissioned.recording, tmp_path / "views.mcap", roles=("map", "test"))
-        said = "no capture of role 'train' to train from"
+        said = "no capture of role 'train' with a label to train from"
         refuses("train", "views.mcap", "--out", "out.npz", code=USAGE, said=said)
 
     def test_nothing_to_make_a_map_of(self, commissioned, refuses, tmp_path):
@@ -318,7 +318,7 @@ class TestMaps:
 
     def test_a_capture_that_is_not_there(self, commissioned, refuses):
         arguments = ("--name", "view_9", "--png", "out.png")
-        said = "no colour capture named view_9"
+        said = "no capture with a colour image named view_9"
         refuses("show", "capture", commissioned.recording, *arguments, code=USAGE, said=said)
 
 
