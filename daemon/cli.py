@@ -188,7 +188,7 @@ def evaluate(
 ) -> None:
     """Accuracy against the labels of the `test` captures: voxels, pixels, calibration."""
     from daemon import offline
-    from daemon.files import check_output
+    from drivers.files import check_output
 
     settings = _settings(thesis, update, pool)
     if (model is None) == (map_ is None):

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import maps, offline, pictures
-from daemon.files import write_atomically
 from daemon.offline import console
+from drivers.files import write_atomically
 from drivers.recording import Recording, RecordingWriter
 from drivers.sensor_package import SensorPackage
 from drivers.sim import truth

@@ -21,9 +21,9 @@ from daemon.check import Verdict, exit_code
 from daemon.check import check as check_all
 from daemon.config import Config, load_config
 from daemon.console import MapClient
-from daemon.files import check_output, read_file, write_atomically
 from daemon.offline import console, progress, write_json
 from daemon.transport import TransportError, open_session
+from drivers.files import check_output, read_file, write_atomically
 from drivers.recording import RecordingWriter, unix_offset_ns
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.map_file import to_npz_bytes

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import pictures
-from daemon.files import check_output, read_file
 from daemon.offline import console, load_map, load_model
+from drivers.files import check_output, read_file
 from drivers.recording import Recording
 from surfclass.errors import InputError
 from surfclass.map_file import MapFile

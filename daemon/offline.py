@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from daemon.files import check_output, read_file, write_atomically
+import calibration.train
+from drivers.files import check_output, read_file, write_atomically
 from drivers.folder import read_folder
 from drivers.recording import Recording, RecordingWriter
 from surfclass.errors import ConfigurationError, InputError
@@ -24,7 +25,7 @@ from surfclass.kinematics import depth_pose
 from surfclass.map_file import MapFile, from_npz_bytes, to_npz_bytes
 from surfclass.model import Model
 from surfclass.pipeline import Pipeline, PipelineSettings
-from surfclass.training import TrainingSettings, train
+from surfclass.training import TrainingSettings
 
 console = Console(stderr=True)
 
@@ -89,27 +90,14 @@ def load_model(path: Path) -> Model:
 
 
 def train_model(recording_path: Path, out: Path, settings: TrainingSettings) -> Model:
-    """Trains from a recording's `train` captures and writes the model."""
-    check_output(out)
-    recording = Recording.open(recording_path)
-    if recording.classes is None:
-        raise InputError(f"{recording_path}: has no classes.toml, so its labels mean nothing")
+    """Trains from a recording's `train` captures, saying what it does, and writes the model."""
     with console.status("training") as status:
 
         def note(sentence: str) -> None:
             status.update(sentence)
             console.print(f"  {sentence}", highlight=False)
 
-        model = train(
-            recording.captures("train"),
-            recording.captures("response"),
-            recording.rig,
-            recording.classes,
-            settings,
-            note,
-        )
-    write_atomically(out, model.to_bytes())
-    return model
+        return calibration.train.train_model(recording_path, out, settings, note)
 
 
 def replay(

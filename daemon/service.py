@@ -14,7 +14,6 @@ from typing import Any
 
 from daemon.acquisition import Acquisition, Phase, Shot
 from daemon.config import Limits
-from daemon.files import write_atomically
 from daemon.logs import log
 from daemon.mapper import Mapper, Process, Publisher
 from daemon.notify import Watchdog, notify, reloading
@@ -23,6 +22,7 @@ from daemon.signals import SignalNotes
 from daemon.sink import RecordingSink
 from daemon.status import Health
 from drivers.errors import DriverUnavailableError
+from drivers.files import write_atomically
 from surfclass.errors import InputError
 from surfclass.types import MapUpdate
 from surfclass.voxel_map import VoxelMap

@@ -15,8 +15,8 @@ from typing import Protocol
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from daemon.config import Config
-from daemon.files import read_file
 from daemon.logs import log
+from drivers.files import read_file
 from drivers.recording import RecordingWriter, unix_offset_ns
 from surfclass import map_pb2
 from surfclass.errors import ConfigurationError, InputError

@@ -17,7 +17,6 @@ import zenoh
 from daemon import logs
 from daemon.acquisition import Acquisition, Shot
 from daemon.config import RELOADABLE, Config, SimSettings, TriggerSettings
-from daemon.files import read_file
 from daemon.notify import notify
 from daemon.publisher import MapPublisher
 from daemon.requests import RequestQueue
@@ -35,6 +34,7 @@ from drivers.capture_source import (
 )
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
+from drivers.files import read_file
 from drivers.interfaces import Clock, Light
 from drivers.recording import Recording
 from drivers.replay import RecordingSource
