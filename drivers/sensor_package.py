@@ -83,11 +83,6 @@ class SensorPackage:
         """Whether every device is."""
         return all(device.is_open for device in self._devices)
 
-    @property
-    def has_arm(self) -> bool:
-        """Whether `read_joints` gives anything."""
-        return self._arm is not None
-
     def open(self) -> None:
         """Opens all devices, or none.
 

@@ -182,9 +182,10 @@ class Svm:
         try:
             values: dict[str, Any] = {name: np.array(arrays[name], dtype=np.float64) for name in _ARRAYS}
             values["gamma"] = float(arrays["gamma"])
+            values |= {name: str(arrays[name]) for name in ("kernel", "held_out")}
         except (TypeError, ValueError) as error:
             raise InputError(f"SVM: {error}") from None
-        return cls(kernel=str(arrays["kernel"]), held_out=str(arrays["held_out"]), **values)  # type: ignore[arg-type]
+        return cls(**values)
 
 
 def train(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import pytest
 
 from drivers.interfaces import Arm, Clock, ColourCamera, DepthCamera, Device, Light
 from drivers.sim.clock import SimClock
 from drivers.sim.devices import SimArm, SimColourCamera, SimDepthCamera, SimLight
-from drivers.sim.faults import DeviceName, Fault, Faults
+from drivers.sim.faults import DeviceName, Fault, FaultKind, Faults
 from drivers.sim.world import SimWorld
 
 Trouble = Literal["missing", "unplugged", "mute", "faulty"]
@@ -51,8 +51,10 @@ def _simulated(realtime: bool) -> Bench:
     kinds = {"missing": "absent", "unplugged": "absent", "mute": "silent", "faulty": "broken"}
 
     def trouble(kind: str, what: Trouble) -> None:
-        device: DeviceName = kind  # type: ignore[assignment]  # the parameter of the tests is one of the four
-        fault = Fault(device, kinds[what], world.seconds(world.clock.now_ns()))  # type: ignore[arg-type]
+        # The tests' parameters are among the names that a fault knows.
+        fault = Fault(
+            cast(DeviceName, kind), cast(FaultKind, kinds[what]), world.seconds(world.clock.now_ns())
+        )
         world.faults = Faults((*world.faults.faults, fault))
 
     return Bench(
