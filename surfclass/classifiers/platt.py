@@ -66,7 +66,9 @@ def fit_sigmoid(f: Float64, positive: Bool) -> tuple[float, float]:
                 break
             step /= 2
         else:
-            break  # no smaller loss in floating point: this is the minimum
+            # The loss cannot tell these two points apart any more; the gradient still can.
+            a, b = a + d_a, b + d_b
+            break
         a, b, loss = a + step * d_a, b + step * d_b, tried
     return a / unit, b
 
