@@ -24,6 +24,7 @@ _log = logging.getLogger("surfclass.acquisition")
 # after so many polls without a capture there is nothing to follow, and they take their real time.
 _FAST_POLLS = 200
 _REPEAT_S = 10.0  # the same reason for rejections is logged again after this
+_REPEAT_ERROR_S = 60.0  # and the same device error
 POLL_S = 0.1  # the longest wait inside the source, and so the longest a request or a stop waits for it
 
 
@@ -82,6 +83,7 @@ class Acquisition:
         self._beat_s = time.monotonic()
         self._names: set[str] = set()
         self._rejection, self._rejection_told_s = "", 0.0
+        self._device_error, self._device_error_told_s = "", 0.0
         self._numbered = 0
         self._successor: Callable[[int], CaptureSource] | None = None
         self.settled = threading.Event()
@@ -130,7 +132,7 @@ class Acquisition:
                     self._open_and_work()
                     self._source.close()
                 except (DriverError, InputError) as error:
-                    self._source.close()
+                    self._release(error)
                     if not self._recover(error):
                         return
         except Exception as error:  # noqa: BLE001 - handed to the service's loop, which ends with it
@@ -147,6 +149,7 @@ class Acquisition:
         self._source.open()
         if self._backoff.attempts:
             self.counts["reopened"] += 1
+            self._device_error = ""
         self._backoff.reset()
         self.phase, self.detail = Phase.RUNNING, ""
         log(_log, logging.INFO, "source open", source=self._source.name)
@@ -229,6 +232,13 @@ class Acquisition:
                 continue
             return
 
+    def _release(self, error: DriverError | InputError) -> None:
+        """Closes what has to be opened anew: one lost device, or everything where waiting is no remedy."""
+        if isinstance(error, DriverError) and remedy(error) in (Remedy.REOPEN, Remedy.RETRY):
+            self._source.release(error.device)
+        else:
+            self._source.close()
+
     def _recover(self, error: DriverError | InputError) -> bool:
         """Waits as the policy says and returns whether to open again; a wrong installation is raised."""
         action = remedy(error) if isinstance(error, DriverError) else Remedy.STOP
@@ -272,6 +282,10 @@ class Acquisition:
 
     def _note(self, error: Exception, next_step: str) -> None:
         self.counts["device_errors"] += 1
+        now_s = time.monotonic()
+        if str(error) == self._device_error and now_s < self._device_error_told_s + _REPEAT_ERROR_S:
+            return  # a device that is away for days must not fill the journal
+        self._device_error, self._device_error_told_s = str(error), now_s
         log(_log, logging.WARNING, "device error", error=error, kind=type(error).__name__, next=next_step)
 
     def _beat(self) -> None:

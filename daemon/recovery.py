@@ -14,7 +14,7 @@ from drivers.errors import (
 )
 
 FIRST_WAIT_S = 0.5
-LONGEST_WAIT_S = 30.0
+LONGEST_WAIT_S = 2.0  # a device that comes back is used again within five seconds, opening included
 
 
 class Remedy(Enum):
@@ -47,7 +47,7 @@ def remedy(error: DriverError) -> Remedy:
 
 
 class Backoff:
-    """The waits between attempts: 0.5, 1, 2 … 30 s, from the start again after a success."""
+    """The waits between attempts: 0.5, 1, 2, 2 … s, from the start again after a success."""
 
     def __init__(self, first_s: float = FIRST_WAIT_S, longest_s: float = LONGEST_WAIT_S) -> None:
         self._first, self._longest = first_s, longest_s

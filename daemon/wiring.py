@@ -49,7 +49,6 @@ from surfclass.rig import Rig, parse_rig
 from surfclass.wire import encode_update
 
 if TYPE_CHECKING:
-    from drivers.sim.views import Viewpoint
     from drivers.sim.world import SimWorld
 
 logger = logging.getLogger("surfclass.wiring")
@@ -131,16 +130,9 @@ def build_world(config: Config) -> SimWorld:
         SimClock(sim.realtime),
         Faults(tuple(faults)),
         scale=sim.scale,
-        program=_spread(scenes.viewpoints(sim.scene), sim.viewpoints),
+        program=scenes.spread(sim.scene, sim.viewpoints),
         ambient=sim.ambient,
     )
-
-
-def _spread(places: tuple[Viewpoint, ...], count: int | None) -> list[Viewpoint]:
-    """Returns `count` of the places, in order and evenly spread from the first to the last."""
-    if count is None or count >= len(places):
-        return list(places)
-    return [places[round(i)] for i in np.linspace(0, len(places) - 1, count)]
 
 
 def build_pipeline(config: Config) -> Pipeline:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
 
-from drivers.errors import CaptureRejectedError
+from drivers.errors import CaptureRejectedError, DeviceLostError, DeviceTimeoutError
 from drivers.interfaces import Clock
 from drivers.sensor_package import SensorPackage
 from drivers.triggers import IntervalTrigger, RequestTrigger, RestTrigger, Trigger
@@ -21,6 +21,8 @@ __all__ = [
     "RestTrigger",
     "Trigger",
 ]
+
+_CHECK_NS = 500_000_000  # so that an operator reads of a loss within two seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,9 @@ class CaptureSource(Protocol):
 
     def close(self) -> None:
         """Releases everything; never raises, may be called twice."""
+
+    def release(self, device: str) -> None:
+        """Releases the device of that name, so that open() starts it anew; never raises."""
 
     def next(self, timeout_s: float, request: CaptureRequest | None = None) -> Capture | None:
         """Returns the next capture, or None if none was due within `timeout_s`.
@@ -105,6 +110,7 @@ class LiveSource:
         self._package, self._trigger, self._clock = package, trigger, clock
         self._default = CaptureRequest(None, role, with_dark)
         self._number = first_number
+        self._check_due_ns = 0
 
     @property
     def name(self) -> str:
@@ -124,6 +130,10 @@ class LiveSource:
         """Turns the light off and releases the sensors."""
         self._package.close()
 
+    def release(self, device: str) -> None:
+        """As `SensorPackage.release`."""
+        self._package.release(device)
+
     def __enter__(self) -> Self:
         self.open()
         return self
@@ -140,12 +150,30 @@ class LiveSource:
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while True:
             now_ns = self._clock.now_ns()
+            if now_ns >= self._check_due_ns:
+                self._check()
             if self._trigger.due(now_ns, self._package.read_joints):
                 return self._take(self._default)
             left_s = (deadline_ns - self._clock.now_ns()) / 1e9
             if left_s <= 0:
                 return None
             self._clock.sleep(max(0.0, min(left_s, self._trigger.wait_s(self._clock.now_ns()))))
+
+    def _check(self) -> None:
+        """Notices now, and not with the next capture, that a device went away or has nothing to say.
+
+        Raises:
+            DeviceLostError: Also for a device that is silent twice.
+            DeviceFaultError: As `SensorPackage.check`.
+        """
+        try:
+            self._package.check()
+        except DeviceTimeoutError:
+            try:
+                self._package.check()
+            except DeviceTimeoutError as error:
+                raise DeviceLostError(error.device, f"silent twice: {error}") from error
+        self._check_due_ns = self._clock.now_ns() + _CHECK_NS
 
     def _take(self, request: CaptureRequest) -> Capture:
         name = request.name or f"{self._number:06d}"
@@ -154,6 +182,7 @@ class LiveSource:
         except CaptureRejectedError:
             self._trigger.rejected(self._clock.now_ns())
             raise
+        self._check_due_ns = self._clock.now_ns() + _CHECK_NS
         self._number += request.name is None
         self._trigger.taken(capture)
         return capture

@@ -12,7 +12,7 @@ class DriverError(Exception):
 
 
 class DeviceNotFoundError(DriverError):
-    """Nothing answers at the address. Policy: retry with backoff 0.5, 1, 2 … 30 s, for ever."""
+    """Nothing answers at the address. Policy: try again after 0.5, 1, 2, 2 … s, for ever."""
 
 
 class DeviceLostError(DriverError):

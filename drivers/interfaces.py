@@ -7,8 +7,9 @@ raises and may be called twice.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Literal, Protocol, Self
 
 from surfclass.frames import ColourFrame, DepthFrame, JointState
 
@@ -39,6 +40,23 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Leaves the device safe (a light off) and released."""
+
+    def check(self) -> None:
+        """Says what became of an open device that nobody is using; takes 0.3 s at most.
+
+        Called about once a second while nothing is captured, so that a loss is noticed before the
+        next capture needs the device.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+
+    def about(self) -> Mapping[str, str]:
+        """Returns facts about an open device for `surfclass check` and for the log.
+
+        The keys are of "library", "model", "serial", "firmware", "address", "format", "settings",
+        "clock", "status"; a fact that the device does not tell is left out.
+        """
 
     def __enter__(self) -> Self: ...
 
@@ -73,6 +91,10 @@ class DepthCamera(Device, Protocol):
 class Light(Device, Protocol):
     """The LED; off after open(), after close() and in every `finally`."""
 
+    @property
+    def timing(self) -> Literal["software", "hardware"]:
+        """Whether a level shines until the next one, or only while the camera's strobe line asks for it."""
+
     def set_level(self, level: float) -> int:
         """Sets the level, 0…1, and returns the time from which it holds, ns.
 
@@ -87,6 +109,15 @@ class Arm(Device, Protocol):
 
     def read_joints(self, timeout_s: float) -> JointState:
         """Returns a reading taken during the call.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+
+    def joints_at(self, t_ns: int, timeout_s: float) -> JointState:
+        """Returns the joint angles at `t_ns`, interpolated between the readings around it.
+
+        Waits for the reading after `t_ns` where that has not come yet. `t_ns` may lie a second back.
 
         Raises:
             DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -62,6 +62,8 @@ class FrameRecord(Table):
     t_ns: int
     sequence: int
     exposure_s: Number | None
+    t_sd_ns: int = 0
+    gain_db: Number | None = None
 
 
 class JointsRecord(Table):
@@ -88,6 +90,7 @@ class CaptureRecord(Table):
     light_level: Number | None
     joint_motion_rad: Number | None
     skew_ns: int
+    light_timing: Literal["software", "hardware"] | None = None
 
 
 @cache
@@ -178,7 +181,9 @@ def capture_from(record: CaptureRecord, parts: Mapping[str, Entry], source: str)
     def colour(kind: str, frame: FrameRecord | None) -> ColourFrame | None:
         if frame is None or kind not in images:
             return None
-        return ColourFrame(frame.t_ns, frame.sequence, frame.exposure_s, images[kind])
+        return ColourFrame(
+            frame.t_ns, frame.sequence, frame.exposure_s, images[kind], frame.t_sd_ns, frame.gain_db
+        )
 
     pose = record.base_T_depth
     try:
@@ -191,6 +196,7 @@ def capture_from(record: CaptureRecord, parts: Mapping[str, Entry], source: str)
                 record.depth.exposure_s,
                 images["depth"],
                 images.get("ir"),
+                record.depth.t_sd_ns,
             ),
             colour=colour("colour", record.colour),
             dark=colour("dark", record.dark),
@@ -200,6 +206,7 @@ def capture_from(record: CaptureRecord, parts: Mapping[str, Entry], source: str)
             light_level=record.light_level,
             joint_motion_rad=record.joint_motion_rad,
             skew_ns=record.skew_ns,
+            light_timing=record.light_timing,
         )
     except ValueError as error:
         raise InputError(f"{where}: {error}") from None
@@ -210,7 +217,14 @@ def _record(capture: Capture, images: tuple[str, ...]) -> CaptureRecord:
         if of is None:
             return None
         exposure = None if of.exposure_s is None else float(of.exposure_s)
-        return FrameRecord(t_ns=int(of.t_ns), sequence=int(of.sequence), exposure_s=exposure)
+        gain_db = of.gain_db if isinstance(of, ColourFrame) else None
+        return FrameRecord(
+            t_ns=int(of.t_ns),
+            sequence=int(of.sequence),
+            exposure_s=exposure,
+            t_sd_ns=int(of.t_sd_ns),
+            gain_db=None if gain_db is None else float(gain_db),
+        )
 
     depth = frame(capture.depth)
     joints, pose = capture.joints, capture.base_T_depth
@@ -228,6 +242,7 @@ def _record(capture: Capture, images: tuple[str, ...]) -> CaptureRecord:
         light_level=None if level is None else float(level),
         joint_motion_rad=None if motion is None else float(motion),
         skew_ns=int(capture.skew_ns),
+        light_timing=capture.light_timing,
     )
 
 

@@ -79,6 +79,10 @@ class RecordingSource:
         """Lets go of the file; never raises, may be called twice."""
         self._captures = self._waiting = None
 
+    def release(self, device: str) -> None:
+        """Closes it: a recording has no devices."""
+        self.close()
+
     def __enter__(self) -> Self:
         self.open()
         return self

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 
-from drivers.errors import CaptureRejectedError, DeviceFaultError, DeviceLostError
+from drivers.errors import (
+    CaptureRejectedError,
+    DeviceFaultError,
+    DeviceLostError,
+    DriverError,
+    DriverUnavailableError,
+)
 from drivers.interfaces import Arm, Clock, ColourCamera, DepthCamera, Device, Light
 from surfclass.errors import ConfigurationError
 from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
 
+_NEEDS_SOMEBODY = (DriverUnavailableError, DeviceFaultError)
 _ROUNDING_NS = 1_000  # of mid-exposure and exposure time, when the start is computed back from them
 
 
@@ -84,31 +90,57 @@ class SensorPackage:
         return all(device.is_open for device in self._devices)
 
     def open(self) -> None:
-        """Opens all devices, or none.
+        """Opens the devices that are not open, the light first.
+
+        What opens stays open where another fails, so that only the missing one is waited for.
 
         Raises:
-            DeviceNotFoundError, DeviceFaultError, DriverUnavailableError: As the first that fails.
+            DeviceNotFoundError, DeviceFaultError, DriverUnavailableError: The first that failed, of
+                those that waiting cannot mend if there is one.
         """
-        with ExitStack() as opened:
-            for device in self._devices:
-                if not device.is_open:
+        errors: list[DriverError] = []
+        for device in self._devices:
+            if not device.is_open:
+                try:
                     device.open()
-                opened.callback(device.close)
-            opened.pop_all()
+                except DriverError as error:
+                    errors.append(error)
+        if errors:
+            raise min(errors, key=lambda error: not isinstance(error, _NEEDS_SOMEBODY))
 
     def close(self) -> None:
         """Turns the light off and releases all devices; never raises."""
         for device in self._devices:
             device.close()
 
+    def release(self, name: str) -> None:
+        """Closes the device of that name, so that open() starts it anew; all where there is none of it."""
+        named = [device for device in self._devices if device.name == name]
+        for device in named or self._devices:
+            device.close()
+
     def __enter__(self) -> Self:
-        self.open()
+        try:
+            self.open()
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def check(self) -> None:
+        """Says what became of the devices while nothing was captured; about 0.3 s a device at most.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the first that fails.
+        """
+        self._must_be_open()
+        for device in self._devices:
+            device.check()
 
     def read_joints(self) -> JointState | None:
         """Returns the joint angles as of now, or None without an arm.
@@ -151,6 +183,7 @@ class SensorPackage:
             colour = self._grab_colour(lit_ns)
             depth = self._grab_depth(lit_ns)
             readings.append(self.read_joints())
+            joints = None if self._arm is None else self._joints_at(self._arm, colour.t_ns)
         finally:
             off_ns = self._light_off()
         dark = None
@@ -164,18 +197,18 @@ class SensorPackage:
                 f"{self.settings.max_skew_s * 1e3:.0f} ms",
                 "skew",
             )
-        joints = [reading for reading in readings if reading is not None]
-        motion = self._motion(name, joints) if joints else None
+        motion = self._motion(name, [reading for reading in (*readings, joints) if reading is not None])
         return Capture(
             name=name,
             role=role,
             depth=depth,
             colour=colour,
             dark=dark,
-            joints=_at(colour.t_ns, joints[0], joints[1]) if joints else None,
+            joints=joints,
             light_level=None if self._light is None else self.settings.light_level,
             joint_motion_rad=motion,
             skew_ns=skew_ns,
+            light_timing=None if self._light is None else self._light.timing,
         )
 
     @property
@@ -226,15 +259,27 @@ class SensorPackage:
         return frame
 
     def _must_be_of_now(self, device: str, frame: ColourFrame | DepthFrame, not_before_ns: int) -> None:
-        began_ns = frame.t_ns - round((frame.exposure_s or 0.0) * 5e8) + _ROUNDING_NS
-        if began_ns < not_before_ns or frame.t_ns > self._clock.now_ns():
+        began_ns = frame.t_ns - frame.t_sd_ns - round((frame.exposure_s or 0.0) * 5e8) + _ROUNDING_NS
+        if began_ns < not_before_ns or frame.t_ns - frame.t_sd_ns > self._clock.now_ns():
             raise CaptureRejectedError(
                 f"{device}: frame {frame.sequence} began {(began_ns - not_before_ns) / 1e6:+.1f} ms from "
                 "when it was allowed to, or lies in the future",
                 "stale",
             )
 
-    def _motion(self, name: str, joints: list[JointState]) -> float:
+    def _joints_at(self, arm: Arm, t_ns: int) -> JointState:
+        joints = arm.joints_at(t_ns, self.settings.joints_timeout_s)
+        if joints.t_ns != t_ns:
+            raise CaptureRejectedError(
+                f"{arm.name}: the joint angles are {(joints.t_ns - t_ns) / 1e6:+.1f} ms from when they "
+                "were asked for",
+                "stale",
+            )
+        return joints
+
+    def _motion(self, name: str, joints: list[JointState]) -> float | None:
+        if not joints:
+            return None
         angles = np.array([reading.q for reading in joints])
         motion = float(np.ptp(angles, axis=0).max())
         if motion > self.settings.max_joint_motion_rad:
@@ -245,10 +290,3 @@ class SensorPackage:
                 "motion",
             )
         return motion
-
-
-def _at(t_ns: int, before: JointState, after: JointState) -> JointState:
-    """The joints at `t_ns`, linear between two readings, as uncertain in time as the worse of them."""
-    span_ns = after.t_ns - before.t_ns
-    part = min(1.0, max(0.0, (t_ns - before.t_ns) / span_ns)) if span_ns > 0 else 0.5
-    return JointState(t_ns, max(before.t_sd_ns, after.t_sd_ns), before.q + part * (after.q - before.q))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +31,16 @@ class ColourFrame:
         sequence: The device's frame counter.
         exposure_s: None where it is not known.
         rgb: (h, w, 3) uint8 or uint16, channels red, green, blue.
+        t_sd_ns: Half the interval in which mid-exposure can have been.
+        gain_db: None where it is not known.
     """
 
     t_ns: int
     sequence: int
     exposure_s: float | None
     rgb: NDArray[np.uint8] | NDArray[np.uint16]
+    t_sd_ns: int = 0
+    gain_db: float | None = None
 
     def __post_init__(self) -> None:
         kinds = (np.uint8, np.uint16)
@@ -53,6 +57,7 @@ class DepthFrame:
         exposure_s: None where it is not known.
         depth_mm: (h, w) uint16, millimetres along the optical axis, 0 = no return.
         ir: (h, w) uint8 or uint16 of the same exposure, or None.
+        t_sd_ns: Half the interval in which mid-exposure can have been.
     """
 
     t_ns: int
@@ -60,6 +65,7 @@ class DepthFrame:
     exposure_s: float | None
     depth_mm: NDArray[np.uint16]
     ir: NDArray[np.uint8] | NDArray[np.uint16] | None = None
+    t_sd_ns: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "depth_mm", _image(self.depth_mm, "depth image", (np.uint16,), 2))
@@ -106,6 +112,8 @@ class Capture:
         light_level: 0…1 of the light during `colour`, or None where it is not controlled.
         joint_motion_rad: Largest joint change between the reads before and after, or None.
         skew_ns: Mid-exposure of depth minus that of colour.
+        light_timing: "software": the light was told and waited for; "hardware": the camera's strobe
+            line fired it; None where it is not controlled or not known.
     """
 
     name: str
@@ -119,6 +127,7 @@ class Capture:
     light_level: float | None = None
     joint_motion_rad: float | None = None
     skew_ns: int = 0
+    light_timing: Literal["software", "hardware"] | None = None
 
     def __post_init__(self) -> None:
         if self.role not in ROLES:
@@ -131,6 +140,11 @@ class Capture:
                     f"capture {self.name}: label image {label.shape[1]} × {label.shape[0]}, the "
                     f"colour image is {self.colour.rgb.shape[1]} × {self.colour.rgb.shape[0]}"
                 )
+
+    @property
+    def skew_sd_ns(self) -> int:
+        """How uncertain `skew_ns` is: by both frames' times."""
+        return self.depth.t_sd_ns + (0 if self.colour is None else self.colour.t_sd_ns)
 
     @property
     def t_ns(self) -> int:

@@ -52,13 +52,14 @@ def capture(seed: int = 0, name: str | None = None, role: str = "test", **change
             image(DEPTH_HEIGHT, DEPTH_WIDTH, kind=np.uint16, below=65536),
         ),
         "colour": ColourFrame(t_ns, 70 + seed, 0.008, image(HEIGHT, WIDTH, 3)),
-        "dark": ColourFrame(t_ns + 90_000_000, 71 + seed, 0.008, image(HEIGHT, WIDTH, 3)),
+        "dark": ColourFrame(t_ns + 90_000_000, 71 + seed, 0.008, image(HEIGHT, WIDTH, 3), 400, -1.5),
         "joints": JointState(t_ns, 1_500_000, rng.normal(size=6)),
         "base_T_depth": Transform("base", "depth", pose(rng)),
         "label": image(HEIGHT, WIDTH, below=3),
         "light_level": 0.1 + 0.2,
         "joint_motion_rad": 1e-5 / 3,
         "skew_ns": 7_000_001,
+        "light_timing": "hardware",
     }
     return Capture(**{**fields, **changes})
 
@@ -73,7 +74,7 @@ def pose(rng: np.random.Generator) -> NDArray[np.float64]:
 
 def assert_same(one: Capture, other: Capture) -> None:
     """Every field equal, bit for bit, pixels with their types."""
-    plain = ("name", "role", "light_level", "joint_motion_rad", "skew_ns", "t_ns")
+    plain = ("name", "role", "light_level", "light_timing", "joint_motion_rad", "skew_ns", "t_ns")
     assert [getattr(one, key) for key in plain] == [getattr(other, key) for key in plain]
     images, others = capture_images(one), capture_images(other)
     assert images.keys() == others.keys()
@@ -84,11 +85,8 @@ def assert_same(one: Capture, other: Capture) -> None:
         frame, twin = getattr(one, kind), getattr(other, kind)
         assert (frame is None) == (twin is None), kind
         if frame is not None:
-            assert (frame.t_ns, frame.sequence, frame.exposure_s) == (
-                twin.t_ns,
-                twin.sequence,
-                twin.exposure_s,
-            ), kind
+            told = ("t_ns", "t_sd_ns", "sequence", "exposure_s", *(["gain_db"] if kind != "depth" else []))
+            assert [getattr(frame, key) for key in told] == [getattr(twin, key) for key in told], kind
     assert (one.joints is None) == (other.joints is None)
     if one.joints is not None and other.joints is not None:
         assert (one.joints.t_ns, one.joints.t_sd_ns) == (other.joints.t_ns, other.joints.t_sd_ns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -51,6 +51,12 @@ class FakeDevice:
         self.log.append(f"{self.name} close")
         self.is_open = False
 
+    def check(self) -> None:
+        self.did("check")
+
+    def about(self) -> dict[str, str]:
+        return {"library": "fake"}
+
     def __enter__(self) -> Self:
         self.open()
         return self
@@ -62,6 +68,7 @@ class FakeDevice:
 
 
 class FakeLight(FakeDevice):
+    timing: Literal["software", "hardware"] = "software"
     level = 0.0
     settle_ns = SETTLE_NS
 
@@ -136,3 +143,8 @@ class FakeArm(FakeDevice):
         t_ns = self.clock.now_ns() + READ_NS // 2 - self.lag_ns
         self.clock.t_ns += READ_NS
         return JointState(t_ns, READ_NS // 2, self.path(t_ns))
+
+    def joints_at(self, t_ns: int, timeout_s: float) -> JointState:
+        assert 0 < timeout_s < 10
+        self.did("interpolate")
+        return JointState(t_ns - self.lag_ns, READ_NS // 2, self.path(t_ns - self.lag_ns))

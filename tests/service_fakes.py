@@ -58,6 +58,9 @@ class Source:
             self.events.append("close source")
         self.is_open = False
 
+    def release(self, device):
+        self.close()
+
     def next(self, timeout_s, request=None):
         assert self.is_open, "used while closed"
         self.requests.append(request)

@@ -40,6 +40,7 @@ def as_imported(of: Capture, sequence: int) -> Capture:
         dark=None if of.dark is None else ColourFrame(t_ns, sequence, exposure, of.dark.rgb),
         joints=None if of.joints is None else JointState(t_ns, 0, of.joints.q),
         light_level=None,
+        light_timing=None,
         joint_motion_rad=None,
         skew_ns=0,
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from drivers.errors import (
 )
 from drivers.sensor_package import SensorPackage, SensorSettings
 from surfclass.errors import ConfigurationError
+from surfclass.frames import ColourFrame
 
 
 @dataclass
@@ -67,7 +69,15 @@ def b() -> Bench:
 
 def test_a_capture_in_order(b: Bench) -> None:
     one = b.package.capture("a", role="test")
-    assert b.log == ["arm read", "light on 1", "colour grab", "depth grab", "arm read", "light off 0"]
+    assert b.log == [
+        "arm read",
+        "light on 1",
+        "colour grab",
+        "depth grab",
+        "arm read",
+        "arm interpolate",
+        "light off 0",
+    ]
     assert (one.name, one.role, one.light_level, one.dark) == ("a", "test", 1.0, None)
     assert one.colour is not None
     assert one.colour.rgb[0, 0, 0] == 200  # exposed wholly while the light held
@@ -242,18 +252,84 @@ def test_a_light_that_takes_too_long_is_a_fault(b: Bench) -> None:
     assert not b.light.is_open
 
 
-def test_open_is_all_or_nothing() -> None:
+def test_what_opens_stays_open_while_another_device_is_missing() -> None:
     b = bench()
-    error = DeviceNotFoundError("depth", "nothing answers")
-    b.depth.fail["open"] = error
-    with pytest.raises(DeviceNotFoundError):
+    b.depth.fail["open"] = DeviceNotFoundError("depth", "nothing answers")
+    with pytest.raises(DeviceNotFoundError, match="depth: nothing answers"):
         b.package.open()
-    assert b.log == ["light open", "arm open", "depth open", "arm close", "light close"]
-    devices: list[FakeDevice] = [b.light, b.arm, b.depth, b.colour]
-    assert not any(device.is_open for device in devices)
+    assert b.log == ["light open", "arm open", "depth open", "colour open"]
     assert not b.package.is_open
     b.package.open()
+    assert b.log[4:] == ["depth open"]
     assert b.package.is_open
+
+
+def test_what_waiting_cannot_mend_is_told_first() -> None:
+    b = bench()
+    b.light.fail["open"] = DeviceNotFoundError("light", "nothing answers")
+    b.depth.fail["open"] = DeviceFaultError("depth", "too hot")
+    with pytest.raises(DeviceFaultError, match="depth: too hot"):
+        b.package.open()
+
+
+def test_a_package_that_cannot_be_entered_leaves_nothing_open() -> None:
+    b = bench()
+    b.depth.fail["open"] = DeviceNotFoundError("depth", "nothing answers")
+    with pytest.raises(DeviceNotFoundError), b.package:
+        pass
+    devices: list[FakeDevice] = [b.light, b.arm, b.depth, b.colour]
+    assert not any(device.is_open for device in devices)
+
+
+def test_one_device_is_released_and_opened_anew(b: Bench) -> None:
+    b.package.release("depth")
+    assert b.log == ["depth close"]
+    b.package.open()
+    assert b.log == ["depth close", "depth open"]
+    b.package.release("something else")
+    assert b.called("light close", "arm close", "colour close") == [
+        "light close",
+        "arm close",
+        "colour close",
+    ]
+
+
+def test_a_check_asks_every_device(b: Bench) -> None:
+    b.package.check()
+    assert b.log == ["light check", "arm check", "depth check", "colour check"]
+    b.colour.fail["check"] = DeviceLostError("colour", "unplugged")
+    with pytest.raises(DeviceLostError, match="colour: unplugged"):
+        b.package.check()
+
+
+def test_a_frame_that_may_have_begun_too_early_is_stale(b: Bench) -> None:
+    grab = b.colour.grab
+
+    def uncertain(not_before_ns: int, timeout_s: float) -> ColourFrame:
+        return replace(grab(not_before_ns, timeout_s), t_sd_ns=200_000)
+
+    b.colour.grab = uncertain
+    with pytest.raises(
+        CaptureRejectedError, match=r"colour: frame 0 began -0\.1 ms from when it was allowed"
+    ):
+        b.package.capture("a")
+
+
+def test_joint_angles_of_another_time_are_stale(b: Bench) -> None:
+    at = b.arm.joints_at
+    b.arm.joints_at = lambda t_ns, timeout_s: at(t_ns - 30_000_000, timeout_s)
+    with pytest.raises(
+        CaptureRejectedError, match=r"arm: the joint angles are -30\.0 ms from when"
+    ) as caught:
+        b.package.capture("a")
+    assert caught.value.reason == "stale"
+    assert b.light.level == 0
+
+
+@pytest.mark.parametrize("timing", ["software", "hardware"])
+def test_a_capture_knows_how_its_light_was_timed(b: Bench, timing: Literal["software", "hardware"]) -> None:
+    b.light.timing = timing
+    assert b.package.capture("a").light_timing == timing
 
 
 def test_close_begins_with_the_light(b: Bench) -> None:

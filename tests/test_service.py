@@ -256,13 +256,13 @@ def test_every_error_class_has_a_policy():
     assert remedy(DriverError("x", "")) is Remedy.STOP
 
 
-def test_backoff_doubles_to_half_a_minute_and_starts_again():
+def test_backoff_doubles_to_two_seconds_and_starts_again():
     backoff = Backoff()
-    assert [backoff.next_s() for _ in range(9)] == [0.5, 1, 2, 4, 8, 16, 30, 30, 30]
+    assert [backoff.next_s() for _ in range(5)] == [0.5, 1, 2, 2, 2]
     backoff.reset()
     assert backoff.next_s() == 0.5
     backoff.attempts = 10**6
-    assert backoff.next_s() == 30
+    assert backoff.next_s() == 2
 
 
 def test_missing_hardware_is_waited_for(tmp_path):
@@ -290,6 +290,15 @@ def test_the_wait_is_short_again_after_a_success(tmp_path, caplog):
         rig.until(lambda: "publish 2" in rig.events)
     waits = [record.fields["next"] for record in caplog.records if record.message == "device error"]
     assert waits == ["opening again in 0.01 s"] * 2
+
+
+def test_a_device_that_stays_away_is_logged_once_until_it_was_back(tmp_path, caplog):
+    absent = DeviceNotFoundError("depth", "nothing at usb 1-2")
+    with caplog.at_level("WARNING"), Rig(tmp_path, [absent], opens=[absent] * 5) as rig:
+        rig.until(lambda: rig.acquisition.counts["reopened"] == 2)
+    told = [record.fields["error"] for record in caplog.records if record.message == "device error"]
+    assert len(told) == 2  # five times away, then there, then away again
+    assert rig.acquisition.counts["device_errors"] == 6
 
 
 def test_a_reload_ends_the_wait_but_an_earlier_one_does_not_shorten_it(tmp_path):

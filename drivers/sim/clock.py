@@ -18,13 +18,16 @@ class SimClock:
             repeats byte for byte. True: it runs with the host's clock, except while the world
             computes an image: a slow computer must not make the simulated arm look fast.
         start_ns: The first reading.
+        of_host: The host's CLOCK_MONOTONIC itself, which no computing stops: for devices in other
+            processes, which share that clock and no other.
     """
 
-    def __init__(self, realtime: bool = False, start_ns: int = START_NS) -> None:
-        self.realtime = realtime
+    def __init__(self, realtime: bool = False, start_ns: int = START_NS, *, of_host: bool = False) -> None:
+        self.realtime = realtime or of_host
+        self._of_host = of_host
         self._lock = threading.Lock()
-        self._now_ns = start_ns
-        self._offset_ns = start_ns - time.monotonic_ns()
+        self._now_ns = 0 if of_host else start_ns
+        self._offset_ns = 0 if of_host else start_ns - time.monotonic_ns()
         self._held_at_ns = 0
         self._holders = 0
 
@@ -49,6 +52,9 @@ class SimClock:
     @contextmanager
     def held(self) -> Iterator[None]:
         """Stops the clock for the block: the computing time is not the world's time."""
+        if self._of_host:
+            yield
+            return
         with self._lock:
             if self._holders == 0:
                 self._held_at_ns = time.monotonic_ns()

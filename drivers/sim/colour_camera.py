@@ -11,6 +11,7 @@ from surfclass.types import Float32
 
 FULL_WELL_E = 12000.0
 READ_NOISE_E = 9.0
+RAW_FULL_SCALE = 65535
 _SHARP_SIGMA_PX = 0.45
 _CURVE_STEPS = 16384
 
@@ -47,20 +48,41 @@ def defocus(package: Package, light: Float32, z: Float32) -> Float32:
     return image
 
 
-def expose(package: Package, irradiance: Float32, noise: np.random.Generator) -> NDArray[np.uint8]:
-    """Returns the raw image (h, w, 3) of linear irradiance (fraction of full scale, after vignetting).
+def expose(
+    package: Package, irradiance: Float32, noise: np.random.Generator, gain: float = 1.0
+) -> NDArray[np.uint8]:
+    """Returns the image (h, w, 3) of linear irradiance (fraction of full scale, after vignetting).
 
-    Photon noise, read noise, saturation, the camera's response, 8 bits.
+    Photon noise, read noise, gain, saturation, the camera's response, 8 bits.
     """
-    electrons = np.maximum(irradiance, 0) * np.float32(FULL_WELL_E)
-    spread = np.sqrt(electrons + np.float32(READ_NOISE_E**2))
-    electrons += spread * noise.standard_normal(irradiance.shape, dtype=np.float32)
-    steps = np.clip(electrons * np.float32((_CURVE_STEPS - 1) / FULL_WELL_E), 0, _CURVE_STEPS - 1)
+    electrons = _electrons(irradiance, noise)
+    steps = np.clip(electrons * np.float32(gain * (_CURVE_STEPS - 1) / FULL_WELL_E), 0, _CURVE_STEPS - 1)
     index = (steps + np.float32(0.5)).astype(np.uint16)
     image = np.empty(irradiance.shape, np.uint8)
     for channel, curve in enumerate(_curves(package)):
         image[..., channel] = curve[index[..., channel]]
     return image
+
+
+def expose_raw(irradiance: Float32, noise: np.random.Generator, gain: float = 1.0) -> NDArray[np.uint16]:
+    """Returns what the sensor's converter gives before the camera's own processing: linear, 65535 is full.
+
+    Args:
+        irradiance: (h, w, 3) fraction of full scale, after vignetting; every pixel in all colours,
+            of which a mosaic keeps one.
+        noise: All that is random in this exposure.
+        gain: Of the converter, as a factor; it raises the noise with the signal.
+    """
+    counts = _electrons(irradiance, noise) * np.float32(gain * RAW_FULL_SCALE / FULL_WELL_E)
+    return np.asarray(np.clip(np.round(counts), 0, RAW_FULL_SCALE).astype(np.uint16))
+
+
+def _electrons(irradiance: Float32, noise: np.random.Generator) -> Float32:
+    """Electrons with photon and read noise; they may exceed the well, or lie below zero."""
+    electrons = np.maximum(irradiance, 0) * np.float32(FULL_WELL_E)
+    spread = np.sqrt(electrons + np.float32(READ_NOISE_E**2))
+    electrons += spread * noise.standard_normal(irradiance.shape, dtype=np.float32)
+    return np.asarray(electrons, dtype=np.float32)
 
 
 def _curves(package: Package) -> list[NDArray[np.uint8]]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from drivers.sim.faults import DeviceName
@@ -56,6 +57,14 @@ class SimDevice:
     def close(self) -> None:
         """Releases the device; may be called twice."""
         self._open = False
+
+    def check(self) -> None:
+        """Raises what a fault makes of the device now."""
+        self._must_answer(self.world.clock.now_ns())
+
+    def about(self) -> Mapping[str, str]:
+        """Says that it is simulated."""
+        return {"library": "drivers.sim", "model": f"simulated {self.kind}", "clock": "the world's"}
 
     def __enter__(self) -> Self:
         self.open()
@@ -174,6 +183,7 @@ class SimLight(SimDevice):
     """The LED's controller."""
 
     kind = "light"
+    timing: Literal["software", "hardware"] = "software"
 
     def open(self) -> None:
         """Finds the light and turns it off."""
@@ -215,14 +225,31 @@ class SimArm(SimDevice):
             InputError: If the timeout is not above 0.
             DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the world's faults say.
         """
-        world, before_ns = self.world, self.world.clock.now_ns()
+        before_ns = self.world.clock.now_ns()
         self._must_answer(before_ns)
         deadline_ns = before_ns + _allowed_wait_ns(timeout_s)
         self._waits_for(before_ns + JOINT_READ_NS, deadline_ns, "joint angles")
-        t_ns = before_ns + JOINT_READ_NS // 2
+        return self._state(before_ns + JOINT_READ_NS // 2, JOINT_READ_NS // 2)
+
+    def joints_at(self, t_ns: int, timeout_s: float) -> JointState:
+        """Returns the joint angles at `t_ns`, as a reader that polls without a pause would know them.
+
+        Raises:
+            InputError: If the timeout is not above 0.
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the world's faults say.
+        """
+        now_ns = self.world.clock.now_ns()
+        self._must_answer(now_ns)
+        deadline_ns = max(now_ns, t_ns) + _allowed_wait_ns(timeout_s)
+        self._waits_for(max(now_ns, t_ns + JOINT_READ_NS), deadline_ns, "joint angles")
+        return self._state(t_ns, JOINT_READ_NS // 2)
+
+    def _state(self, t_ns: int, t_sd_ns: int) -> JointState:
+        """The read-out at `t_ns`, with its noise."""
+        world = self.world
         stale = world.fault(self.kind, "stale", t_ns)
         q = world.joints(world.began_ns + round(stale.from_s * 1e9) if stale else t_ns)
         if world.joint_noise_rad > 0:
             noise = stream(world.seed, "joints", t_ns // 1000)
             q = q + world.joint_noise_rad * noise.standard_normal(6)
-        return JointState(t_ns, JOINT_READ_NS // 2, q)
+        return JointState(t_ns, t_sd_ns, q)

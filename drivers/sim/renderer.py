@@ -34,6 +34,7 @@ class Renderer:
         self._textures: dict[int, Texture] = {}
         self._lock = threading.RLock()
         self._last: tuple[bytes, Float32, Float32, Float32] | None = None
+        self._last_depth: tuple[bytes, Hits, Float32, Float32] | None = None
 
     def hits(self, base_T_camera: Transform) -> Hits:
         """Returns what the pixels see of the camera whose frame, "rgb" or "depth", the pose is of."""
@@ -57,19 +58,49 @@ class Renderer:
         return image * np.float32(exposure_s / self.package.nominal_exposure_s)
 
     def colour(
-        self, base_T_rgb: Transform, level: float, ambient: float, exposure_s: float, key: int
+        self,
+        base_T_rgb: Transform,
+        level: float,
+        ambient: float,
+        exposure_s: float,
+        key: int,
+        gain: float = 1.0,
     ) -> NDArray[np.uint8]:
-        """Returns the raw image (h, w, 3) of frame `key`, which only its noise depends on."""
+        """Returns the image (h, w, 3) of frame `key`, which only its noise depends on."""
         light = self.irradiance(base_T_rgb, level, ambient, exposure_s)
-        return colour_camera.expose(self.package, light, stream(self.seed, "colour", key))
+        return colour_camera.expose(self.package, light, stream(self.seed, "colour", key), gain)
+
+    def raw(
+        self,
+        base_T_rgb: Transform,
+        level: float,
+        ambient: float,
+        exposure_s: float,
+        key: int,
+        gain: float = 1.0,
+    ) -> NDArray[np.uint16]:
+        """Returns the linear image (h, w, 3) before the camera's own processing, of frame `key`."""
+        light = self.irradiance(base_T_rgb, level, ambient, exposure_s)
+        return colour_camera.expose_raw(light, stream(self.seed, "colour", key), gain)
 
     def depth(self, base_T_depth: Transform, key: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """Returns depth (h, w) in mm and IR (h, w) in 0…1023 of frame `key`."""
+        hits, light, cosine = self._infrared(base_T_depth)
+        return depth_camera.measure(self.package, hits, light, cosine, stream(self.seed, "depth", key))
+
+    def _infrared(self, base_T_depth: Transform) -> tuple[Hits, Float32, Float32]:
+        """What the depth camera sees and how its projector lights it; kept for the next frame at rest."""
+        key = base_T_depth.matrix.tobytes()
+        with self._lock:
+            if self._last_depth is not None and self._last_depth[0] == key:
+                return self._last_depth[1:]
         hits = self.hits(base_T_depth)
         present = set(np.unique(hits.face).tolist())
         textures = [self.texture(n) if n in present else None for n in range(len(hits.faces))]
         light, cosine = depth_camera.infrared(self.package, hits, textures, self.seed)
-        return depth_camera.measure(self.package, hits, light, cosine, stream(self.seed, "depth", key))
+        with self._lock:
+            self._last_depth = (key, hits, light, cosine)
+        return hits, light, cosine
 
     def _radiance(self, base_T_rgb: Transform) -> tuple[Float32, Float32, Float32]:
         """Lit image at full level, albedo image and depth, before the lens; kept for a dark frame."""

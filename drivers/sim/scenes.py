@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 
+import numpy as np
+
 from drivers.sim.materials import CLASS_NAMES
 from drivers.sim.shapes import box, upright, wall
 from drivers.sim.surfaces import Surface, bands, checker, discs
@@ -197,3 +199,15 @@ def viewpoints(name: str) -> tuple[Viewpoint, ...]:
     """
     scene = build(name)
     return reach(scene.looks, scene.surfaces)
+
+
+def spread(name: str, count: int | None) -> list[Viewpoint]:
+    """Returns `count` of the scene's views, in order and evenly spread from the first to the last.
+
+    Raises:
+        ConfigurationError: If there is no such scene.
+    """
+    places = viewpoints(name)
+    if count is None or count >= len(places):
+        return list(places)
+    return [places[round(i)] for i in np.linspace(0, len(places) - 1, count)]

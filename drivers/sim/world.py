@@ -213,12 +213,20 @@ class SimWorld:
             return self.renderer.irradiance(self.base_T_rgb(q), level, self.ambient, exposure)
 
     def render_colour(
-        self, q: Float64, level: float, key: int, exposure_s: float | None = None
+        self, q: Float64, level: float, key: int, exposure_s: float | None = None, gain: float = 1.0
     ) -> NDArray[np.uint8]:
-        """Returns the raw colour image (h, w, 3) of frame `key`, which only its noise depends on."""
+        """Returns the colour image (h, w, 3) of frame `key`, which only its noise depends on."""
         with self.clock.held():
             exposure = self.exposure_s if exposure_s is None else exposure_s
-            return self.renderer.colour(self.base_T_rgb(q), level, self.ambient, exposure, key)
+            return self.renderer.colour(self.base_T_rgb(q), level, self.ambient, exposure, key, gain)
+
+    def render_raw(
+        self, q: Float64, level: float, key: int, exposure_s: float | None = None, gain: float = 1.0
+    ) -> NDArray[np.uint16]:
+        """Returns the sensor's linear image (h, w, 3) of frame `key`, before the camera's processing."""
+        with self.clock.held():
+            exposure = self.exposure_s if exposure_s is None else exposure_s
+            return self.renderer.raw(self.base_T_rgb(q), level, self.ambient, exposure, key, gain)
 
     def render_depth(self, q: Float64, key: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """Returns depth (h, w) in mm and IR (h, w) in 0…1023 of frame `key`."""

@@ -1,73 +1,46 @@
-"""The backends that the contract is tested on; another one is one more entry of BACKENDS."""
+"""Runs each contract test on every backend that has the device it is about."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal, cast
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from bench import Backend, Bench
 
-from drivers.interfaces import Arm, Clock, ColourCamera, DepthCamera, Device, Light
-from drivers.sim.clock import SimClock
-from drivers.sim.devices import SimArm, SimColourCamera, SimDepthCamera, SimLight
-from drivers.sim.faults import DeviceName, Fault, FaultKind, Faults
-from drivers.sim.world import SimWorld
-
-Trouble = Literal["missing", "unplugged", "mute", "faulty"]
+# Each names a module beside this file with a list BACKENDS.
+BENCHES = ("bench_sim",)
 
 
-@dataclass
-class Bench:
-    """One set of devices, closed, and what a test may do to the world behind them.
+def backends() -> list[Backend]:
+    return [backend for name in BENCHES for backend in importlib.import_module(name).BACKENDS]
 
-    Attributes:
-        clock: The one they stamp with.
-        colour: May be None where a backend has no such device; likewise the others.
-        trouble: Makes a device fail from now on, or None where nobody can (real hardware).
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Parametrizes `bench` over the backends, for the kinds that `@pytest.mark.kinds` names.
+
+    A test marked `@pytest.mark.trouble(name)` runs only where the bench can make that trouble.
     """
-
-    clock: Clock
-    colour: ColourCamera | None
-    depth: DepthCamera | None
-    light: Light | None
-    arm: Arm | None
-    trouble: Callable[[str, Trouble], None] | None
-
-    def device(self, kind: str) -> Device:
-        device: Device | None = getattr(self, kind)
-        if device is None:
-            pytest.skip(f"this backend has no {kind} device")
-        return device
-
-    def fail(self, kind: str, trouble: Trouble) -> None:
-        if self.trouble is None:
-            pytest.skip("nothing here can make the device fail")
-        self.trouble(kind, trouble)
+    if "bench" not in metafunc.fixturenames:
+        return
+    marker = metafunc.definition.get_closest_marker("kinds")
+    assert marker is not None, f"{metafunc.definition.nodeid}: which kinds of device is it about?"
+    troubles = {mark.args[0] for mark in metafunc.definition.iter_markers("trouble")}
+    rows = [
+        (backend, kind)
+        for backend in backends()
+        for kind in marker.args
+        if kind in backend.troubles and troubles <= backend.troubles[kind]
+    ]
+    if "kind" in metafunc.fixturenames:
+        params = [backend.param(kind) for backend, kind in rows]
+        metafunc.parametrize(("bench", "kind"), params, indirect=["bench"])
+    else:
+        metafunc.parametrize("bench", [backend.param() for backend, _ in rows], indirect=True)
 
 
-def _simulated(realtime: bool) -> Bench:
-    world = SimWorld("grey_card", seed=1, clock=SimClock(realtime), scale=0.05)
-    kinds = {"missing": "absent", "unplugged": "absent", "mute": "silent", "faulty": "broken"}
-
-    def trouble(kind: str, what: Trouble) -> None:
-        # The tests' parameters are among the names that a fault knows.
-        fault = Fault(
-            cast(DeviceName, kind), cast(FaultKind, kinds[what]), world.seconds(world.clock.now_ns())
-        )
-        world.faults = Faults((*world.faults.faults, fault))
-
-    return Bench(
-        world.clock, SimColourCamera(world), SimDepthCamera(world), SimLight(world), SimArm(world), trouble
-    )
-
-
-BACKENDS: dict[str, Callable[[], Bench]] = {
-    "sim": lambda: _simulated(realtime=False),
-    "sim, real time": lambda: _simulated(realtime=True),
-}
-
-
-@pytest.fixture(params=BACKENDS)
-def bench(request: pytest.FixtureRequest) -> Bench:
-    return BACKENDS[request.param]()
+@pytest.fixture
+def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
+    with request.param.make(tmp_path) as made:
+        yield made
