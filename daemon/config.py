@@ -149,6 +149,15 @@ class DeviceSettings(BaseModel):
         """Everything but `backend`."""
         return dict(self.model_extra or {})
 
+    def anchored(self, directory: Path) -> DeviceSettings:
+        """Returns the settings with every option that is a file's path starting from `directory`."""
+        paths = {
+            key: str(directory / value)
+            for key, value in self.options.items()
+            if key.endswith("_path") and isinstance(value, str)
+        }
+        return self.model_validate({**self.model_dump(), **paths})
+
 
 class SimFault(Table):
     """One thing that goes wrong on purpose; as `drivers.sim.faults.Fault`, times in the world's seconds."""
@@ -306,6 +315,8 @@ def _anchored(table: T, directory: Path) -> T:
         value = getattr(table, name)
         if isinstance(value, Path):
             changes[name] = directory / value
+        elif isinstance(value, DeviceSettings):
+            changes[name] = value.anchored(directory)
         elif isinstance(value, Table):
             changes[name] = _anchored(value, directory)
     return table.model_copy(update=changes)

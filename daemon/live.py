@@ -17,10 +17,10 @@ import numpy as np
 from rich.table import Table
 
 from daemon import wiring
-from daemon.check import Verdict, exit_code
 from daemon.check import check as check_all
 from daemon.config import Config, load_config
 from daemon.console import MapClient
+from daemon.findings import Verdict, exit_code
 from daemon.offline import console, progress, write_json
 from daemon.transport import TransportError, open_session
 from drivers.files import check_output, read_file, write_atomically

@@ -14,8 +14,8 @@ import pytest
 from service_site import build_site
 
 from daemon import check, wiring
-from daemon.check import Verdict
 from daemon.config import load_config
+from daemon.findings import Verdict, exit_code
 from daemon.transport import TransportError, ask, open_session
 from drivers.recording import Recording
 from surfclass.errors import ConfigurationError
@@ -251,7 +251,7 @@ def test_check_of_a_good_site(site):
     assert re.search(r"128 × 96 uint8, [\d.]+ frames/s", by_subject["colour"].message)
     assert re.search(r"64 × 48 uint16, ", by_subject["depth"].message)
     assert re.search(r"[\d,]+ voxels in \d+ ms", by_subject["pipeline"].message)
-    assert check.exit_code(findings) == 0
+    assert exit_code(findings) == 0
     json.dumps([finding.as_json() for finding in findings])
     assert not list(site.glob("*.mcap*"))
 
@@ -266,13 +266,13 @@ def test_check_tells_a_missing_device_from_a_wrong_file(site):
     assert "silent" in verdicts["arm"].advice
     assert verdicts["colour"].verdict is Verdict.OK
     assert "capture" not in verdicts
-    assert check.exit_code(findings) == 69
+    assert exit_code(findings) == 69
     wrong = [*base, "model=rig.toml", "recording.directory=absent/absent"]
     findings = check.check(load_config(site / "surfclass.toml", wrong))
     count = Counter(finding.subject for finding in findings if finding.verdict is Verdict.CONFIGURATION)
     assert count == {"rig and model": 1, "recording": 1}
     assert all(finding.advice for finding in findings if finding.verdict is not Verdict.OK)
-    assert check.exit_code(findings) == 78
+    assert exit_code(findings) == 78
 
 
 def test_check_finds_what_a_crash_left(site):
@@ -280,4 +280,4 @@ def test_check_finds_what_a_crash_left(site):
     findings = check.check(load_config(site / "surfclass.toml", ["recording.directory=."]))
     warned = [finding for finding in findings if finding.verdict is Verdict.WARNING]
     assert [finding.advice for finding in warned] == [f"surfclass recover {site}/x.mcap.active"]
-    assert check.exit_code(findings) == 0
+    assert exit_code(findings) == 0

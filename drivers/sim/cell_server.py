@@ -91,17 +91,24 @@ class CellServer:
             while True:
                 try:
                     request = json.loads(connection.recv_bytes(_HEADER_BYTES))
-                    lights = lights or request["call"] == "set_light"
-                    self._answer(connection, request)
+                    call, args = str(request["call"]), list(request["args"])
                 except (EOFError, OSError):
+                    break
+                except (ValueError, LookupError, TypeError) as error:
+                    _log.warning("a client that does not speak our language is hung up on: %s", error)
+                    break
+                lights = lights or call == "set_light"
+                try:
+                    self._answer(connection, call, args)
+                except OSError:
                     break
         if lights and self.cell.light_is_on:
             _log.warning("the light's controller vanished: the light is off")
             self.cell.set_light(0.0, time.monotonic_ns())
 
-    def _answer(self, connection: Connection, request: dict[str, Any]) -> None:
+    def _answer(self, connection: Connection, call: str, args: list[Any]) -> None:
         try:
-            value = self._call(request["call"], request.get("args", []))
+            value = self._call(call, args)
         except Exception as error:  # noqa: BLE001 - told to the client, which raises it
             connection.send_bytes(json.dumps({"error": f"{type(error).__name__}: {error}"}).encode())
             return
