@@ -21,9 +21,11 @@ _RECENT = 64
 _JUMP_NS = 50e6  # further off than this, a stamp is of another clock
 _LATE_RUN = 16  # so many stamps in a row, all late by a jump: it is the clock that moved
 _WANDER = 1e-6  # how far the drift may be from that of a straight line
-# The least of n delays is further from none than from the k-th least with a chance of 2^(1-k), where
-# delays are the rarer the longer they are. Below k stamps nothing is known yet but what a frame takes.
-_ORDER = 8
+_NEWEST = 8  # say how late stamps are now, against what is known from before
+# Where longer delays are the rarer ones, the least of n is further from none than from the k-th least with
+# a chance of 2^(1-k); the line touches two of them. Below k stamps, what a frame takes to arrive is all
+# that is known.
+_ORDER = 10
 _FIRST_DELAY_NS = 20e6
 _DRIFT_SPAN_S = 5.0  # drift is told from here on
 
@@ -31,10 +33,12 @@ _DRIFT_SPAN_S = 5.0  # drift is told from here on
 class DeviceClock:
     """Maps the ticks of a device's clock to host CLOCK_MONOTONIC.
 
-    Observe each stamp once, as its frame arrives; then ask for its time. A stamp that goes back, or is
-    further off than drift and the delays seen allow, is of a clock that was reset: what was known is
-    dropped and `jumps` counts it. One that repeats the last says that the clock stands still, or that the
-    frame is the last one again; `frozen` counts those.
+    Observe each stamp once, as its frame arrives; then ask for its time. Times get sure within the first
+    ten stamps: without triggers, the first is held to be up to 20 ms off, the n-th up to 20 ms / n.
+
+    A stamp that goes back, or is further off than drift and the delays seen allow, is of a clock that was
+    reset: what was known is dropped and `jumps` counts it. One that repeats the last says that the clock
+    stands still, or that the frame is the last one again; `frozen` counts those.
 
     Args:
         tick_s: One tick, s.
@@ -49,7 +53,7 @@ class DeviceClock:
         frozen: How often a stamp repeated the one before.
 
     Raises:
-        InputError: If an argument is not finite or has the wrong sign.
+        InputError: If an argument is outside what is allowed.
     """
 
     def __init__(
@@ -61,8 +65,8 @@ class DeviceClock:
         wrap_ticks: int | None = None,
         max_drift_ppm: float = 500.0,
     ) -> None:
-        if not 0 < tick_s < math.inf:
-            raise InputError(f"tick_s {tick_s}, allowed is above 0 and finite")
+        if not 1e-12 <= tick_s <= 1:
+            raise InputError(f"tick_s {tick_s}, allowed is 1e-12 to 1")
         if not (0 <= latency_s < math.inf and 0 <= latency_sd_s < math.inf):
             raise InputError(f"latency {latency_s} ± {latency_sd_s} s, allowed is 0 or more and finite")
         if wrap_ticks is not None and wrap_ticks < 2:
@@ -81,11 +85,11 @@ class DeviceClock:
 
     @property
     def drift_ppm(self) -> float | None:
-        """How much faster than the device's clock the host's runs; None until 5 s were seen."""
+        """How much too fast the device's clock runs; None until 5 s were seen."""
         seen_ns = self._hull[-1][0] - self._hull[0][0] if self._hull else 0.0
         if seen_ns < _DRIFT_SPAN_S * 1e9 or len(self._recent) < _ORDER:
             return None
-        return self._slope * 1e6
+        return -self._slope * 1e6
 
     @property
     def offset_ns(self) -> int | None:
@@ -121,7 +125,8 @@ class DeviceClock:
             self.frozen += 1
             return
         if self._hull and self._is_another_clock(x, before, not_after_ns, not_before_ns):
-            self.jumps += 1
+            # Not counted: first frames that were held back for long, so that a prompt one seems early.
+            self.jumps += x < before or len(self._recent) >= _ORDER
             self._restart(ticks, not_after_ns)
             unwrapped, x = ticks, 0.0
         elif self._hull and x - before > WINDOW_S * 1e9:
@@ -235,7 +240,7 @@ class DeviceClock:
         if known and right > left:
             slack = min(slack, scatter / (right - left) + _WANDER)
         low = line - sd - scatter - slack * max(0.0, left - x, x - right)
-        newest = list(self._recent)[-_ORDER:]
+        newest = list(self._recent)[-_NEWEST:]
         high = line + sd + min(y - self._line(at) + slack * abs(x - at) for at, y in newest)
         if self._lower:
             sent = max(y + self._slope * (x - at) - slack * abs(x - at) for at, y in self._lower)
