@@ -1,0 +1,359 @@
+"""An IIDC camera by libdc1394, such as Point Grey's Firefly MV on USB: raw Bayer, demosaiced here.
+
+Tested against Debian's real library with a camera emulated down to its registers; not on a camera.
+
+libdc1394 gives frames of a USB camera no time of its own, so their times come by construction: an
+exposure by software trigger began after that was sent and ended before the frame was here. The library
+may crash or hang once the camera is unplugged: `colour` therefore makes a camera in a process of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NoReturn, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.bayer import demosaic
+from drivers.dc1394 import Camera, Dc1394Error, Library
+from drivers.dc1394_types import CAPTURE_FLAGS_DEFAULT, ISO_SPEED_400, LIBRARY, PACKAGE
+from drivers.errors import (
+    DeviceFaultError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    DriverUnavailableError,
+)
+from drivers.iidc_features import Exposure, set_exposure, set_registers, set_strobe, set_trigger
+from drivers.iidc_format import Format, set_format
+from drivers.iidc_options import IidcOptions, SetupError
+from drivers.iidc_stream import Arrival, IidcStream, StreamEndedError
+from drivers.interfaces import Clock
+from drivers.isolation import IsolatedCamera
+from surfclass.errors import InputError
+from surfclass.frames import ColourFrame
+from surfclass.schema import validate
+
+_READY_POLL_S = 0.001
+_USB_DEVICES = Path("/sys/bus/usb/devices")
+_POINT_GREY_USB = "1e10"
+
+
+def colour(
+    *, name: str, clock: Clock, options: Mapping[str, Any], shared: dict[str, Any]
+) -> IsolatedCamera[ColourFrame]:
+    """An IIDC camera in a process of its own.
+
+    Raises:
+        ConfigurationError: For options that are none of IidcOptions'.
+    """
+    validate(IidcOptions, options, name)
+    return IsolatedCamera("drivers.colour_iidc:in_process", name=name, options=options)
+
+
+def in_process(*, name: str, clock: Clock, options: Mapping[str, Any], shared: dict[str, Any]) -> IidcCamera:
+    """The same in this process, which must not outlive the camera's loss."""
+    return IidcCamera(name, clock, validate(IidcOptions, options, name))
+
+
+class IidcCamera:
+    """A `ColourCamera` on libdc1394, in the process that calls it.
+
+    After a DeviceLostError nothing of the library is called any more, so what it holds stays held until
+    the process ends.
+
+    Args:
+        name: How messages call it.
+        clock: The host's.
+        options: What is wanted of it.
+    """
+
+    def __init__(self, name: str, clock: Clock, options: IidcOptions) -> None:
+        self._name, self._clock, self._options = name, clock, options
+        self._library: Library | None = None
+        self._camera: Camera | None = None
+        self._stream: IidcStream | None = None
+        self._capturing = False
+        self._format: Format | None = None
+        self._exposure: Exposure | None = None
+        self._lost = ""
+        self._due_ns: int | None = None  # until when the frame of a trigger that was given up may come
+        self._late = self._unasked = 0
+
+    @property
+    def name(self) -> str:
+        """How messages call it."""
+        return self._name
+
+    @property
+    def is_open(self) -> bool:
+        """Between a successful open() and close()."""
+        return self._stream is not None
+
+    def open(self) -> None:
+        """Finds the camera, sets it up, reads everything back and starts it.
+
+        Raises:
+            DriverUnavailableError: If libdc1394 is not installed.
+            DeviceNotFoundError: If there is no such camera, or it went away meanwhile.
+            DeviceFaultError: If it cannot do what the options ask for, or does not keep it.
+        """
+        self.close()
+        self._lost, self._due_ns, self._late, self._unasked = "", None, 0, 0
+        try:
+            self._library = Library()
+        except OSError as error:
+            raise DriverUnavailableError(
+                self._name, f"{LIBRARY} cannot be loaded ({error}); install the Debian package {PACKAGE}"
+            ) from error
+        try:
+            self._camera = self._find(self._library)
+            self._start(self._camera)
+        except BaseException as error:
+            if isinstance(error, Dc1394Error) and error.means_gone:
+                self._lost = str(error)
+            self.close()
+            if isinstance(error, Dc1394Error) and error.means_gone:
+                raise DeviceNotFoundError(
+                    self._name, f"the camera did not answer while it was set up: {error}"
+                ) from error
+            if isinstance(error, Dc1394Error | SetupError):
+                raise DeviceFaultError(self._name, str(error)) from error
+            raise
+
+    def close(self) -> None:
+        """Stops the camera and releases it; a lost one is only forgotten."""
+        stream, self._stream = self._stream, None
+        camera, self._camera = self._camera, None
+        library, self._library = self._library, None
+        capturing, self._capturing = self._capturing, False
+        stopped = stream is None or stream.stop()
+        if self._lost or not stopped or (stream is not None and stream.ended):
+            return
+        with contextlib.suppress(Dc1394Error):  # unplugged this moment: then it is only forgotten as well
+            if camera is not None:
+                camera.call("video_set_transmission", 0)
+                if self._options.trigger != "free":
+                    camera.call("external_trigger_set_power", 0)
+                if capturing:
+                    camera.call("capture_stop")
+                camera.close()
+            if library is not None:
+                library.close()
+
+    def check(self) -> None:
+        """Says whether the camera answers and still transmits.
+
+        Raises:
+            DeviceLostError: If it does not.
+        """
+        camera, stream = self._opened()
+        if stream.ended:
+            self._lose(stream.ended)
+        try:
+            transmits = camera.number("video_get_transmission")
+        except Dc1394Error as error:
+            self._lose(str(error))
+        if not transmits:
+            self._lose("it no longer transmits: it was reset, or another program stopped it")
+
+    def about(self) -> Mapping[str, str]:
+        """Returns what the camera is, how it is set up, and what became of its frames.
+
+        Raises:
+            DeviceLostError: If it does not answer.
+        """
+        camera, stream = self._opened()
+        assert self._format is not None
+        assert self._exposure is not None
+        try:
+            platform = camera.platform()
+            device, bus = camera.pair("camera_get_node")
+        except Dc1394Error as error:
+            self._lose(str(error))
+        return {
+            "library": f"libdc1394 ({LIBRARY})",
+            "model": f"{camera.vendor} {camera.model}".strip() or "unnamed",
+            "serial": f"{camera.guid:016x}",
+            "address": f"usb {bus:03d}:{device:03d}" if platform == "usb" else f"{platform} node {device}",
+            "format": self._format.name,
+            "settings": f"{self._exposure.text}, trigger {self._options.trigger}",
+            "clock": "the host's: the camera stamps nothing",
+            "status": f"{stream.frames} frames, {stream.corrupt} corrupt, {self._late} too late, "
+            f"{self._unasked} not asked for",
+        }
+
+    def grab(self, not_before_ns: int, timeout_s: float) -> ColourFrame:
+        """Returns the first frame whose exposure certainly began at or after `not_before_ns`.
+
+        Raises:
+            InputError: If the timeout is not above 0 and finite.
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+        if not 0 < timeout_s < math.inf:
+            raise InputError(f"timeout {timeout_s} s, allowed is above 0 and finite")
+        camera, stream = self._opened()
+        begin_ns = max(not_before_ns, self._clock.now_ns())
+        deadline_ns = begin_ns + round(timeout_s * 1e9)
+        try:
+            if self._options.trigger == "software":
+                return self._triggered(camera, stream, begin_ns, deadline_ns)
+            return self._running(stream, not_before_ns, deadline_ns)
+        except (StreamEndedError, Dc1394Error) as error:
+            self._lose(str(error))
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _find(self, library: Library) -> Camera:
+        guids = library.guids()
+        wanted = self._options.guid
+        there = ", ".join(f"{guid:016x}" for guid in guids)
+        if not guids:
+            raise DeviceNotFoundError(self._name, f"libdc1394 finds no camera{_hint()}")
+        if wanted is not None and int(wanted, 16) not in guids:
+            raise DeviceNotFoundError(self._name, f"no camera with guid {wanted}; there are: {there}")
+        if wanted is None and len(guids) > 1:
+            raise DeviceFaultError(self._name, f"there are several cameras; set guid to one of {there}")
+        return library.camera(guids[0] if wanted is None else int(wanted, 16))
+
+    def _start(self, camera: Camera) -> None:
+        options = self._options
+        if camera.can_switch_on_off:
+            camera.call("camera_set_power", 1)
+        camera.call("video_set_transmission", 0)
+        camera.call("video_set_iso_speed", ISO_SPEED_400)  # FireWire's; USB has one speed
+        set_registers(camera, options)
+        self._format = set_format(camera, options)
+        self._exposure = set_exposure(camera, options)
+        set_trigger(camera, options)
+        set_strobe(camera, options)
+        if options.trigger != "software" and (self._exposure.period_s or options.readout_max_s) is None:
+            raise SetupError(f"mode {options.mode}: the camera tells no frame rate; give readout_max_s")
+        camera.call("capture_setup", options.buffers, CAPTURE_FLAGS_DEFAULT)
+        self._capturing = True
+        self._stream = IidcStream(camera, options.buffers, self._clock)
+        camera.call("video_set_transmission", 1)
+
+    def _triggered(self, camera: Camera, stream: IidcStream, begin_ns: int, deadline_ns: int) -> ColourFrame:
+        """Triggers at `begin_ns`, and again where the frame comes damaged or is lost."""
+        self._outwait_late_frame(stream, deadline_ns)
+        stream.rest_until(begin_ns)
+        while True:
+            while camera.number("software_trigger_get_power"):  # busy with an exposure
+                self._before(deadline_ns, "the camera was not ready for a trigger")
+                stream.rest_until(self._clock.now_ns() + round(_READY_POLL_S * 1e9))
+            self._unasked += stream.clear()
+            sent_ns = self._clock.now_ns()
+            self._due_ns = sent_ns + self._least_ns() + round(self._options.late_s * 1e9)
+            camera.call("software_trigger_set_power", 1)
+            while (arrival := stream.next(min(deadline_ns, self._due_ns))) is not None:
+                if arrival.at_ns - sent_ns >= self._least_ns():
+                    break
+                self._unasked += 1  # its exposure cannot have begun after the trigger
+            if arrival is None:
+                self._before(deadline_ns, "no frame came in time")
+                self._late += 1
+                continue
+            self._due_ns = None
+            if arrival.image is not None:
+                return self._frame(arrival, arrival.image, sent_ns)
+            self._before(deadline_ns, "frames came damaged")
+
+    def _running(self, stream: IidcStream, not_before_ns: int, deadline_ns: int) -> ColourFrame:
+        """Waits for an exposure that the camera or a line begins."""
+        while (arrival := stream.next(deadline_ns)) is not None:
+            if arrival.image is not None and self._earliest_ns(arrival) >= not_before_ns:
+                return self._frame(arrival, arrival.image, self._earliest_ns(arrival))
+        raise DeviceTimeoutError(self._name, "no frame came in time")
+
+    def _outwait_late_frame(self, stream: IidcStream, deadline_ns: int) -> None:
+        """Waits until the frame of a trigger that was given up has come or will not come any more."""
+        while self._due_ns is not None:
+            if stream.next(min(deadline_ns, self._due_ns)) is not None:
+                self._due_ns = None
+                self._late += 1
+            elif self._clock.now_ns() >= self._due_ns:
+                self._due_ns = None
+            else:
+                self._before(deadline_ns, "a frame from before is still under way")
+
+    def _frame(self, arrival: Arrival, image: bytes, earliest_ns: int) -> ColourFrame:
+        """The frame of an exposure that began at `earliest_ns` or later."""
+        form, exposure = self._format, self._exposure
+        assert form is not None
+        assert exposure is not None
+        if len(image) != form.size_bytes:
+            raise DeviceFaultError(
+                self._name, f"an image of {len(image)} bytes came, {form.size_bytes} are in {form.name}"
+            )
+        raw: NDArray[np.uint8] | NDArray[np.uint16] = np.frombuffer(image, np.uint8)
+        if form.bits > 8:
+            raw = raw.view(">u2").astype(np.uint16)
+        try:
+            rgb = demosaic(raw.reshape(form.height, form.width), form.pattern, form.bits)
+        except InputError as error:
+            raise DeviceFaultError(self._name, f"{error}; see the option bits") from error
+        if self._options.readout_max_s is not None:
+            earliest_ns = max(earliest_ns, self._earliest_ns(arrival))
+        latest_ns = arrival.at_ns - self._least_ns()
+        return ColourFrame(
+            (earliest_ns + latest_ns + round(exposure.exposure_s * 1e9)) // 2,
+            arrival.sequence,
+            exposure.exposure_s,
+            rgb,
+            t_sd_ns=(latest_ns - earliest_ns + 1) // 2,
+            gain_db=exposure.gain_db,
+        )
+
+    def _least_ns(self) -> int:
+        """From an exposure's begin until its frame is here, at least."""
+        assert self._exposure is not None
+        return round((self._exposure.exposure_s + self._options.readout_min_s) * 1e9)
+
+    def _earliest_ns(self, arrival: Arrival) -> int:
+        """When the exposure of a frame began at the earliest, by its arrival."""
+        assert self._exposure is not None
+        readout_s = self._options.readout_max_s or self._exposure.period_s
+        assert readout_s is not None  # _start sees to it
+        return arrival.after_ns - round((readout_s + self._exposure.exposure_s) * 1e9)
+
+    def _opened(self) -> tuple[Camera, IidcStream]:
+        if self._lost:
+            raise DeviceLostError(self._name, self._lost)
+        if self._camera is None or self._stream is None:
+            raise DeviceLostError(self._name, "it is not open")
+        return self._camera, self._stream
+
+    def _lose(self, how: str) -> NoReturn:
+        """From here on the library is not called any more."""
+        self._lost = f"the camera went away: {how}"
+        raise DeviceLostError(self._name, self._lost)
+
+    def _before(self, deadline_ns: int, otherwise: str) -> None:
+        if self._clock.now_ns() >= deadline_ns:
+            raise DeviceTimeoutError(self._name, otherwise)
+
+
+def _hint() -> str:
+    """What keeps libdc1394 from a camera that the kernel sees."""
+    for device in _USB_DEVICES.glob("*/idVendor"):
+        with contextlib.suppress(OSError):  # unplugged this moment
+            if device.read_text().strip() == _POINT_GREY_USB:
+                return (
+                    ", though one of Point Grey's is on USB: it needs the udev rule "
+                    f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{_POINT_GREY_USB}", GROUP="video", MODE="0660" '
+                    "and this user in the group video; a USB 3 camera needs the aravis backend"
+                )
+    return ""
