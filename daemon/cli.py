@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daemon.cli_sim import sim
+
 if TYPE_CHECKING:
     from surfclass.pipeline import PipelineSettings
 
@@ -44,6 +46,7 @@ app = typer.Typer(
 )
 show = typer.Typer(no_args_is_help=True, help="Draw results: a map as picture or PLY, a capture's images.")
 app.add_typer(show, name="show")
+app.add_typer(sim, name="sim")
 
 RecordingArgument = Annotated[Path, typer.Argument(metavar="REC.mcap", help="A recording.")]
 ModelOption = Annotated[Path, typer.Option("--model", metavar="MODEL", help="What `train` wrote.")]
@@ -342,11 +345,14 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")] = Path("out/demo"),
     seed: Annotated[int, typer.Option(min=0, help="Of the simulated cell.")] = 0,
     viewpoints: Annotated[int, typer.Option(min=1, max=15, help="How many places to visit.")] = 10,
+    real_drivers: Annotated[
+        bool, typer.Option("--real-drivers", help="By OpenNI2, Aravis, serial line and b-CAP.")
+    ] = False,
 ) -> None:
     """Everything once, on the simulated cell: commission, train, map with a service, watch it, score it."""
     from daemon.demo import run_demo
 
-    raise typer.Exit(run_demo(out, seed, viewpoints))
+    raise typer.Exit(run_demo(out, seed, viewpoints, real_drivers))
 
 
 def _settings(thesis: bool, update: Update | None, pool: Pool | None) -> PipelineSettings:

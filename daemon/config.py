@@ -60,10 +60,13 @@ class CaptureOptions(Table):
     Attributes:
         dark: Also take an unlit frame, so that ambient light can be subtracted.
         level: The light's level, 0…1.
+        max_skew_s: Colour and depth may be this far apart; the arm stands still meanwhile, or the
+            capture is rejected for that.
     """
 
     dark: Switch = False
     level: Annotated[Number, Field(ge=0, le=1)] = 1.0
+    max_skew_s: Positive = 0.15
 
 
 class RecordingSettings(Table):

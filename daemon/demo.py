@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import maps, offline, pictures
+from daemon.demo_stages import EmulatedStage, SimulatedStage, Stage
 from daemon.offline import console
+from daemon.processes import STOP_S, last_words, process
 from drivers.files import write_atomically
 from drivers.recording import Recording, RecordingWriter
-from drivers.sensor_package import SensorPackage
 from drivers.sim import truth
-from drivers.sim.devices import SimArm, SimColourCamera, SimDepthCamera, SimLight
 from drivers.sim.world import SimWorld
 from surfclass.errors import InputError
 from surfclass.frames import Capture
@@ -34,11 +30,17 @@ from surfclass.rig import parse_classes
 from surfclass.training import TrainingSettings
 
 _WAIT_S = 240.0
-_STOP_S = 30.0
 
 
-def run_demo(out: Path, seed: int, viewpoints: int) -> int:
+def run_demo(out: Path, seed: int, viewpoints: int, real_drivers: bool = False) -> int:
     """Runs the demo into `out` and returns the exit code: 0 if the console's map equals the service's.
+
+    Args:
+        out: Where everything goes.
+        seed: Of the simulated cell.
+        viewpoints: How many places are visited.
+        real_drivers: Through OpenNI2, Aravis, the light's serial protocol and b-CAP, with an emulated
+            device behind each, instead of simulated devices.
 
     Raises:
         InputError: If a step finds its input unusable; the message says which.
@@ -47,19 +49,24 @@ def run_demo(out: Path, seed: int, viewpoints: int) -> int:
     out.mkdir(parents=True, exist_ok=True)
     _clear(out)
 
-    console.rule("1  commission from the simulation's truth")
     world = SimWorld("cell", seed)
-    rig_text, classes_text = truth.rig(world), truth.classes_toml()
-    write_atomically(out / "rig.toml", rig_text.encode())
-    write_atomically(out / "classes.toml", classes_text.encode())
-    console.print(f"rig.toml, classes.toml: {len(parse_classes(classes_text, 'classes').names)} surfaces")
+    stage = EmulatedStage(out, seed, viewpoints) if real_drivers else SimulatedStage(seed, viewpoints)
+    if real_drivers:
+        console.rule("0  start the emulated devices")
+    with stage:
+        console.rule("1  commission from the simulation's truth")
+        rig_text, classes_text = stage.rig(), truth.classes_toml()
+        write_atomically(out / "rig.toml", rig_text.encode())
+        write_atomically(out / "classes.toml", classes_text.encode())
+        console.print(f"rig.toml, classes.toml: {len(parse_classes(classes_text, 'classes').names)} surfaces")
 
-    console.rule("2  train from one board of each surface, at 0.65 m and 0°")
-    _capture_boards(out / "train.mcap", rig_text, classes_text, seed)
-    offline.train_model(out / "train.mcap", out / "model.npz", TrainingSettings())
+        console.rule("2  train from one board of each surface, at 0.65 m and 0°")
+        _capture_boards(out / "train.mcap", rig_text, classes_text, seed, stage)
+        devices = stage.cell()
+        offline.train_model(out / "train.mcap", out / "model.npz", TrainingSettings())
 
-    console.rule(f"3  map the cell from {viewpoints} viewpoints: service and console in two processes")
-    recorded, stage_ms = _map_cell(out, world, viewpoints)
+        console.rule(f"3  map the cell from {viewpoints} viewpoints: service and console in two processes")
+        recorded, stage_ms = _map_cell(out, world, viewpoints, devices)
 
     console.rule("4  score the map against the simulation's truth")
     _label(recorded, out / "test.mcap", world)
@@ -91,7 +98,7 @@ def _clear(out: Path) -> None:
             path.unlink()
 
 
-def _capture_boards(path: Path, rig_text: str, classes_text: str, seed: int) -> None:
+def _capture_boards(path: Path, rig_text: str, classes_text: str, seed: int, stage: Stage) -> None:
     """Captures one board of each surface, labelled by what was put there."""
     names = parse_classes(classes_text, "classes").names
     with (
@@ -99,10 +106,8 @@ def _capture_boards(path: Path, rig_text: str, classes_text: str, seed: int) -> 
         offline.progress(len(names), "capturing") as advance,
     ):
         for number, name in enumerate(names):
-            world = SimWorld(f"board:{name}", seed + 1 + number)
-            devices = SimColourCamera(world), SimDepthCamera(world), SimLight(world), SimArm(world)
-            with SensorPackage(world.clock, *devices) as package:
-                capture = package.capture(f"train_{name}", "train")
+            package, world = stage.board(f"board:{name}", seed + 1 + number)
+            capture = package.capture(f"train_{name}", "train")
             writer.write(dataclasses.replace(capture, label=_truth_label(world, capture)))
             advance(name)
 
@@ -113,7 +118,7 @@ def _truth_label(world: SimWorld, capture: Capture) -> NDArray[np.uint8]:
     return truth.label_image(world, capture.joints.q)
 
 
-def _map_cell(out: Path, world: SimWorld, viewpoints: int) -> tuple[Path, dict[str, float]]:
+def _map_cell(out: Path, world: SimWorld, viewpoints: int, devices: str) -> tuple[Path, dict[str, float]]:
     """Runs service and console until the console's map holds every viewpoint.
 
     Returns:
@@ -122,20 +127,18 @@ def _map_cell(out: Path, world: SimWorld, viewpoints: int) -> tuple[Path, dict[s
     with tempfile.TemporaryDirectory(prefix="surfclass-") as sockets:
         endpoint = f"unixsock-stream/{sockets}/z"
         config = out / "service.toml"
-        write_atomically(
-            config, _CONFIG.format(seed=world.seed, viewpoints=viewpoints, endpoint=endpoint).encode()
-        )
+        write_atomically(config, f"{_CONFIG.format(endpoint=endpoint)}\n{devices}".encode())
         watch = ["watch", "--connect", endpoint, "--robot", "demo", "--captures", str(viewpoints)]
         watch += ["--timeout-s", str(_WAIT_S), "--map", str(out / "console.npz")]
         watch += ["--json", str(out / "console.json")]
         with (
-            _process(out / "daemon.log", ["run", "--config", str(config)]) as service,
-            _process(out / "console.log", watch) as watcher,
+            process(out / "daemon.log", ["run", "--config", str(config)]) as service,
+            process(out / "console.log", watch) as watcher,
             console.status("the arm visits the cell"),
         ):
             _wait(watcher, service, out, world)
             service.send_signal(signal.SIGTERM)
-            service.wait(_STOP_S)
+            service.wait(STOP_S)
     (recording,) = (out / "recordings").glob("*.mcap")
     return recording, json.loads((out / "console.json").read_text())["status"]["stage_ms"]
 
@@ -151,42 +154,13 @@ def _wait(
     surfaces = list(range(len(world.renderer.surfaces)))
     while watcher.poll() is None:
         if service.poll() is not None:
-            raise InputError(
-                f"the service ended with {service.returncode}: {_last_words(out / 'daemon.log')}"
-            )
+            raise InputError(f"the service ended with {service.returncode}: {last_words(out / 'daemon.log')}")
         if surfaces:
             world.texture(surfaces.pop(0))
         else:
             time.sleep(0.2)
     if watcher.returncode != 0:
-        raise InputError(f"the console ended with {watcher.returncode}: {_last_words(out / 'console.log')}")
-
-
-def _last_words(log: Path) -> str:
-    return " / ".join(log.read_text(errors="replace").splitlines()[-3:])
-
-
-@contextmanager
-def _process(log: Path, arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """Runs a command of this program; it is gone at the end, whatever happens."""
-    with log.open("wb") as stream:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "daemon", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=stream,
-            stderr=stream,
-            env=os.environ | {"NO_COLOR": "1"},
-        )
-        try:
-            yield process
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                try:
-                    process.wait(_STOP_S)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+        raise InputError(f"the console ended with {watcher.returncode}: {last_words(out / 'console.log')}")
 
 
 def _label(recorded: Path, out: Path, world: SimWorld) -> None:
@@ -230,21 +204,4 @@ directory = "recordings"
 
 [zenoh]
 listen = ["{endpoint}"]
-
-[colour]
-backend = "sim"
-
-[depth]
-backend = "sim"
-
-[light]
-backend = "sim"
-
-[arm]
-backend = "sim"
-
-[sim]
-scene = "cell"
-seed = {seed}
-viewpoints = {viewpoints}
 """

@@ -103,6 +103,7 @@ def build_package(config: Config, clock: Clock, devices: Mapping[str, Any]) -> S
     seconds = config.limits.device_s
     settings = SensorSettings(
         light_level=config.capture.level,
+        max_skew_s=config.capture.max_skew_s,
         colour_timeout_s=seconds,
         depth_timeout_s=seconds,
         joints_timeout_s=seconds,

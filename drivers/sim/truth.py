@@ -121,13 +121,18 @@ def plate_toml(world: SimWorld) -> str:
     return f"disc_radius_m = {DISC_RADIUS_M}\npositions_base_m = [\n{rows},\n]\n"
 
 
-def rig(world: SimWorld) -> str:
+def rig(world: SimWorld, raw: bool = False) -> str:
     """Returns the text of `rig.toml` as a perfect calibration would give it.
 
     Complete but for the thesis' polynomial of Eq. 4.4, which is no truth of this camera.
+
+    Args:
+        world: What is calibrated.
+        raw: Whether images are the sensor's own, which are linear, or went through the response.
     """
     package = world.package
     led = package.led
+    curves = [[0.0, 1.0]] * 3 if raw else package.response_inverse
     lines = [
         "schema = 1",
         f'name = "simulated {world.scene.name}"',
@@ -142,7 +147,7 @@ def rig(world: SimWorld) -> str:
         f"axis_rgb = {_numbers(led.axis)}",
         f"falloff_exponent = {led.falloff_exponent}",
         "[response]",
-        f"inverse = [{', '.join(_numbers(curve) for curve in package.response_inverse)}]",
+        f"inverse = [{', '.join(_numbers(curve) for curve in curves)}]",
         "[features]",
         'colour = "K_d"',
         'texture = "LBP"',
