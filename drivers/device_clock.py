@@ -17,7 +17,7 @@ from surfclass.errors import InputError
 
 WINDOW_S = 300.0  # a crystal's drift changes by about 1 ppm in this time: 0.1 ms of curvature
 _HULL_POINTS = 64
-_RECENT = 64
+_SAMPLES = 128  # half of them the newest, the rest the thinner the older
 _JUMP_NS = 50e6  # further off than this, a stamp is of another clock
 _LATE_RUN = 16  # so many stamps in a row, all late by a jump: it is the clock that moved
 _WANDER = 1e-6  # how far the drift may be from that of a straight line
@@ -78,7 +78,7 @@ class DeviceClock:
         self.jumps = 0
         self.frozen = 0
         # Points are (x, y): device time since the origin, and host minus device time, ns.
-        self._origin: tuple[int, int] | None = None  # ticks, host ns
+        self._origin_ticks, self._origin_ns = 0, 0
         self._ticks, self._arrival_ns = 0, 0  # the newest stamp, unwrapped
         self._issued: tuple[float, int] | None = None  # the newest time given out, for order
         self._forget()
@@ -87,17 +87,17 @@ class DeviceClock:
     def drift_ppm(self) -> float | None:
         """How much too fast the device's clock runs; None until 5 s were seen."""
         seen_ns = self._hull[-1][0] - self._hull[0][0] if self._hull else 0.0
-        if seen_ns < _DRIFT_SPAN_S * 1e9 or len(self._recent) < _ORDER:
+        if seen_ns < _DRIFT_SPAN_S * 1e9 or len(self._samples) < _ORDER:
             return None
         return -self._slope * 1e6
 
     @property
     def offset_ns(self) -> int | None:
         """Host minus device time at the newest stamp; None before the first."""
-        if self._origin is None:
+        if not self._hull:
             return None
         device_ns = self._ticks * self._tick_ns
-        return self._origin[1] + round(self._x(self._ticks) + self._line(self._x(self._ticks)) - device_ns)
+        return self._origin_ns + round(self._x(self._ticks) + self._line(self._x(self._ticks)) - device_ns)
 
     def describe(self) -> str:
         """Returns offset, drift, uncertainty and what went wrong, in words."""
@@ -117,7 +117,7 @@ class DeviceClock:
             not_after_ns: When it arrived.
             not_before_ns: When the trigger was sent that it answers, or None.
         """
-        if self._origin is None:
+        if not self._hull:
             self._restart(ticks, not_after_ns)
         unwrapped = self._unwrapped(ticks, not_after_ns)
         x, before = self._x(unwrapped), self._x(self._ticks)
@@ -126,17 +126,16 @@ class DeviceClock:
             return
         if self._hull and self._is_another_clock(x, before, not_after_ns, not_before_ns):
             # Not counted: first frames that were held back for long, so that a prompt one seems early.
-            self.jumps += x < before or len(self._recent) >= _ORDER
+            self.jumps += x < before or len(self._samples) >= _ORDER
             self._restart(ticks, not_after_ns)
             unwrapped, x = ticks, 0.0
         elif self._hull and x - before > WINDOW_S * 1e9:
             self._forget()
         self._ticks, self._arrival_ns = unwrapped, not_after_ns
-        assert self._origin is not None
-        point = (x, not_after_ns - self._origin[1] - self._latency_ns - x)
-        self._recent.append(point)
+        point = (x, not_after_ns - self._origin_ns - self._latency_ns - x)
+        self._samples.append(point)
         if not_before_ns is not None and not_before_ns <= not_after_ns:
-            self._lower.append((x, not_before_ns - self._origin[1] - x))
+            self._lower.append((x, not_before_ns - self._origin_ns - x))
         self._add(point)
 
     def to_host(self, ticks: int) -> tuple[int, int]:
@@ -148,23 +147,22 @@ class DeviceClock:
         Raises:
             InputError: If no stamp was observed yet.
         """
-        if self._origin is None:
+        if not self._hull:
             raise InputError("a device's clock before its first stamp was observed")
         x = self._x(self._near(ticks))
         estimate, half = self._estimate(x)
-        time_ns = self._origin[1] + round(x + estimate)
+        time_ns = self._origin_ns + round(x + estimate)
         if self._issued is not None:
             at, issued_ns = self._issued
             ordered_ns = max(time_ns, issued_ns + 1) if x > at else min(time_ns, issued_ns - (x < at))
             half += abs(ordered_ns - time_ns)
             time_ns = ordered_ns
-        if self._issued is None or x > self._issued[0]:
-            self._issued = x, min(time_ns, self._arrival_ns)
+        if x <= self._x(self._ticks) and (self._issued is None or x > self._issued[0]):
+            self._issued = x, time_ns
         return time_ns, math.ceil(half)
 
     def _x(self, unwrapped: int) -> float:
-        assert self._origin is not None
-        return (unwrapped - self._origin[0]) * self._tick_ns
+        return (unwrapped - self._origin_ticks) * self._tick_ns
 
     def _line(self, x: float) -> float:
         return self._slope * x + self._intercept
@@ -181,7 +179,7 @@ class DeviceClock:
         return self._near(ticks, self._ticks + round((arrival_ns - self._arrival_ns) / self._tick_ns))
 
     def _restart(self, ticks: int, arrival_ns: int) -> None:
-        self._origin = ticks, arrival_ns
+        self._origin_ticks, self._origin_ns = ticks, arrival_ns
         self._ticks, self._arrival_ns = ticks, arrival_ns
         if self._issued is not None:
             self._issued = -math.inf, self._issued[1]
@@ -189,22 +187,21 @@ class DeviceClock:
 
     def _forget(self) -> None:
         self._hull: list[tuple[float, float]] = []
-        self._recent: deque[tuple[float, float]] = deque(maxlen=_RECENT)
-        self._lower: deque[tuple[float, float]] = deque(maxlen=_RECENT)
+        self._samples: list[tuple[float, float]] = []
+        self._lower: deque[tuple[float, float]] = deque(maxlen=_SAMPLES)
         self._slope = self._intercept = 0.0
         self._touching = 0.0, 0.0  # x of the points that the line touches
         self._late = 0
 
     def _is_another_clock(self, x: float, before: float, arrival_ns: int, sent_ns: int | None) -> bool:
-        assert self._origin is not None
         if x < before:
             return True
         allowed = _JUMP_NS + self._latency_sd_ns + 2 * self._max_drift * (x - before)
-        late = arrival_ns - self._origin[1] - self._latency_ns - x - self._line(x)
+        late = arrival_ns - self._origin_ns - self._latency_ns - x - self._line(x)
         self._late = self._late + 1 if late > allowed else 0
         if late < -allowed or self._late >= _LATE_RUN:
             return True
-        return sent_ns is not None and sent_ns - self._origin[1] - x - self._line(x) > allowed
+        return sent_ns is not None and sent_ns - self._origin_ns - x - self._line(x) > allowed
 
     def _add(self, point: tuple[float, float]) -> None:
         """Extends the hull to the right and lays the line below it."""
@@ -215,9 +212,11 @@ class DeviceClock:
         first = point[0] - WINDOW_S * 1e9
         while len(hull) > _HULL_POINTS or hull[0][0] < first:
             hull.pop(0)
-        for points in (self._recent, self._lower):
-            while points and points[0][0] < first:
-                points.popleft()
+        while self._lower and self._lower[0][0] < first:
+            self._lower.popleft()
+        if len(self._samples) > _SAMPLES:
+            newest = self._samples[-_SAMPLES // 2 :]
+            self._samples = [at for at in self._samples[: -_SAMPLES // 2 : 2] if at[0] >= first] + newest
         middle = (hull[0][0] + point[0]) / 2
         for left, right in itertools.pairwise(hull):
             if left[0] <= middle <= right[0]:
@@ -228,19 +227,30 @@ class DeviceClock:
         if len(hull) == 1 or abs(self._slope) == self._max_drift:
             self._touching = x, x
 
+    def _too_high(self, x: float) -> tuple[float, float]:
+        """How far the line may be above the truth at x, ns, and how far its slope may be off."""
+        left, right = self._touching
+        widest = self._max_drift + abs(self._slope)
+        residuals = [y - self._line(at) for at, y in self._samples]
+        if left == right:
+            return _scatter(residuals) + widest * abs(x - left), widest
+        # Each of the two points has its delay from the samples on its side.
+        middle = (self._hull[0][0] + self._hull[-1][0]) / 2
+        before = sum(at < middle for at, _ in self._samples)
+        at_left, at_right = _scatter(residuals[:before]), _scatter(residuals[before:])
+        part = min(1.0, max(0.0, (x - left) / (right - left)))
+        here = at_left * (1 - part) + at_right * part
+        beyond = max(0.0, left - x, x - right)
+        turn = min(widest, here / (right - left) + _WANDER)
+        slack = min(widest, max(at_left, at_right) / (right - left) + _WANDER)
+        return here + turn * beyond, slack
+
     def _estimate(self, x: float) -> tuple[float, float]:
         """Host minus device time at x, and the half interval, ns."""
         line, sd = self._line(x), self._latency_sd_ns
-        residuals = sorted(y - self._line(at) for at, y in self._recent)
-        known = len(residuals) >= _ORDER
-        scatter = residuals[_ORDER - 1] if known else max(residuals[-1], _FIRST_DELAY_NS / len(residuals))
-        # The line is no more than the scatter too high where it touches; in between, and beyond as it turns.
-        left, right = self._touching
-        slack = self._max_drift + abs(self._slope)
-        if known and right > left:
-            slack = min(slack, scatter / (right - left) + _WANDER)
-        low = line - sd - scatter - slack * max(0.0, left - x, x - right)
-        newest = list(self._recent)[-_NEWEST:]
+        too_high, slack = self._too_high(x)
+        low = line - sd - too_high
+        newest = self._samples[-_NEWEST:]
         high = line + sd + min(y - self._line(at) + slack * abs(x - at) for at, y in newest)
         if self._lower:
             sent = max(y + self._slope * (x - at) - slack * abs(x - at) for at, y in self._lower)
@@ -252,6 +262,13 @@ class DeviceClock:
             if low > high:  # the bounds contradict each other: between them, or as far again
                 low, high, line = high, low, (low + high) / 2
         return line, max(high - line, line - low)
+
+
+def _scatter(residuals: list[float]) -> float:
+    """How far the least of these may be from no delay at all, ns."""
+    if len(residuals) >= _ORDER:
+        return sorted(residuals)[_ORDER - 1]
+    return max([_FIRST_DELAY_NS / max(1, len(residuals)), *residuals])
 
 
 def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
