@@ -1,0 +1,61 @@
+"""What the binding raises, and which of the drivers' five errors that is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundError, DriverUnavailableError
+
+_OUT_OF_FLOW = 5  # api.Status.OUT_OF_FLOW: what cannot be done now, as something else is under way
+
+
+class OpenNI2Error(Exception):
+    """A call that did not succeed.
+
+    Attributes:
+        status: The OniStatus.
+    """
+
+    def __init__(self, what: str, status: int, words: str) -> None:
+        super().__init__(f"{what}: {words or f'OpenNI2 status {status}'}")
+        self.status = status
+
+
+class PluginMissingError(Exception):
+    """A library or a plug-in is not there, or not as this version of the project needs it."""
+
+
+class SettingError(Exception):
+    """A device that cannot do what measuring needs, or does not keep to it."""
+
+
+class GoneError(Exception):
+    """The device was unplugged."""
+
+
+class BrokenError(Exception):
+    """What the device sends, or what the file holds, cannot be used."""
+
+
+def driver_error(name: str, error: BaseException) -> BaseException:
+    """Returns one of the five errors for what the binding raised, and anything else as it is."""
+    match error:
+        case PluginMissingError():
+            return DriverUnavailableError(name, str(error))
+        case GoneError():
+            return DeviceLostError(name, "it was unplugged")
+        case OpenNI2Error() if error.status != _OUT_OF_FLOW:
+            return DeviceNotFoundError(name, str(error))
+        case SettingError() | BrokenError() | OpenNI2Error():
+            return DeviceFaultError(name, str(error))
+    return error
+
+
+@contextmanager
+def driver_errors(name: str) -> Iterator[None]:
+    """Makes one of the five errors of what the binding raises inside."""
+    try:
+        yield
+    except (PluginMissingError, SettingError, OpenNI2Error, GoneError, BrokenError) as error:
+        raise driver_error(name, error) from error
