@@ -49,7 +49,7 @@ def run_kinect(cell_socket: Path | None, memory: Path, rate_hz: float) -> int:
     """Runs a virtual Kinect, which OpenNI2 finds by its plug-in."""
     from drivers.sim.virtual_kinect import VirtualKinect
 
-    with _cell(cell_socket) as cell:
+    with _cell(cell_socket, images=True) as cell:
         kinect = VirtualKinect(cell, memory, fps=rate_hz)
         return _run(cell, kinect, f"virtual Kinect: {kinect.uri}")
 
@@ -58,17 +58,18 @@ def run_camera(cell_socket: Path | None, serial: str, address: str) -> int:
     """Runs a GigE Vision camera."""
     from drivers.sim.gige_camera import GigeCamera
 
-    with _cell(cell_socket) as cell:
+    with _cell(cell_socket, images=True) as cell:
         return _run(cell, GigeCamera(cell, serial, address), f"GigE Vision camera {serial} at {address}")
 
 
 @contextmanager
-def _cell(socket: Path | None) -> Iterator[Cell]:
-    """The cell of `surfclass sim cell`, or one of its own."""
+def _cell(socket: Path | None, images: bool = False) -> Iterator[Cell]:
+    """The cell of `surfclass sim cell`, or one of its own, ready to give images at once if they are needed."""
     if socket is None:
-        with console.status("making the simulated cell"):
-            made = host_cell()
-            made.bake()
+        made = host_cell()
+        if images:
+            with console.status("making the simulated cell"):
+                made.bake()
         yield made
         return
     client = CellClient(socket)

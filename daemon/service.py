@@ -53,6 +53,7 @@ class Service:
         encode: Encodes a map update for the recording.
         map_bytes: Encodes the map for its file.
         map_path: Where the map goes at the end; None: nowhere.
+        devices: What each device is, for the status; None: captures come from a recording.
         program_done: Whether a simulated arm has finished its programme; None where it is not simulated.
         reload: Reads the configuration again, takes over what can be and says what cannot; raises
             InputError, and has then changed nothing.
@@ -73,6 +74,7 @@ class Service:
         encode: Callable[[MapUpdate], bytes] | None = None,
         map_bytes: Callable[[VoxelMap], bytes] | None = None,
         map_path: Path | None = None,
+        devices: Callable[[], dict[str, Any]] | None = None,
         program_done: Callable[[], bool] | None = None,
         reload: Callable[[], str] | None = None,
         exit_when_done: bool = False,
@@ -81,7 +83,7 @@ class Service:
         self._requests, self._shots, self._limits, self._robot = requests, shots, limits, robot
         self._sink = sink
         self._map_bytes, self._map_path = map_bytes, map_path
-        self._program_done, self._reload = program_done, reload
+        self._devices, self._program_done, self._reload = devices, program_done, reload
         self._exit_when_done = exit_when_done
         self._stop = threading.Event()
         self._reload_asked = threading.Event()
@@ -135,6 +137,7 @@ class Service:
             "t_unix_s": round(time.time(), 3),
             "uptime_s": round(time.monotonic() - self._started_s, 1),
             "acquisition": acquisition.phase.value,
+            "devices": None if self._devices is None else self._devices(),
             "counts": {**acquisition.counts, "refused": self._requests.refused, **self._mapper.counts},
             "waiting": {
                 "captures": self._shots.qsize() + (self._mapper.held is not None),

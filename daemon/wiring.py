@@ -264,6 +264,7 @@ def build_service(
         encode=encode_update,
         map_bytes=partial(to_npz_bytes, pool=config.pipeline.pool),
         map_path=config.map,
+        devices=None if sensors is None else partial(_devices_told, config, sensors),
         program_done=None if world is None else lambda: world.program_done,
         reload=None if load is None else Reload(config, load, acquisition, sensors),
         exit_when_done=exit_when_done,
@@ -271,6 +272,18 @@ def build_service(
     # One more than may wait, so that the next one hears at once that the robot is busy.
     publisher.serve("capture", service.capture, threads=config.limits.waiting_requests + 1)
     return service
+
+
+def _devices_told(config: Config, sensors: Sensors) -> dict[str, Any]:
+    """What the status says of each device: its backend, whether it is open, its process if it has one."""
+    return {
+        kind: {
+            "backend": config.devices[kind].backend,
+            "open": device.is_open,
+            "process": getattr(device, "pid", None),
+        }
+        for kind, device in sensors.devices.items()
+    }
 
 
 class Reload:
