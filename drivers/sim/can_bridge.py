@@ -52,7 +52,7 @@ class CanBridge:
 
     A cycle reads all joints at one time, then sends a SYNC (id 0x80) and three frames (0x181 to 0x183)
     with two joints each: 24 bits, little endian, signed, 1e-4 degrees; byte 6 is 0, byte 7 the cycle's
-    counter. `docs/examples/can_joints.dbc` says the same.
+    counter. `systemd/can_joints.dbc` says the same.
 
     Args:
         cell: Whose joints.

@@ -20,11 +20,12 @@ from drivers.sim.can_nodes import COUNTS_PER_TURN, NODE_IDS, ZERO_COUNTS, CiaNod
 from drivers.sim.slcan_adapter import SlcanAdapter
 from surfclass.types import Float64
 
-DBC = Path(__file__).resolve().parents[2] / "docs/examples/can_joints.dbc"
+DBC = Path(__file__).resolve().parents[2] / "systemd/can_joints.dbc"
 MESSAGES = ("Joints12", "Joints34", "Joints56")
 PERIOD_S = 0.02
 OPEN_S = 1.5
 SLACK_S = 0.3
+VM_SLACK_S = 1.0  # emulated processors
 VCAN = "vcan0"
 
 _BRIDGE_FAULTS: dict[Trouble, BridgeFault] = {
@@ -101,7 +102,8 @@ def bridge_bench(
         replug()
 
     arm = dbc(name="arm", clock=SystemClock(), options=options, shared={})
-    return Bench(SystemClock(), arm=arm, fail=fail, mend=mend, slack_s=SLACK_S)
+    slack_s = VM_SLACK_S if options["interface"] == "socketcan" else SLACK_S
+    return Bench(SystemClock(), arm=arm, fail=fail, mend=mend, slack_s=slack_s)
 
 
 @contextmanager
