@@ -11,9 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from firefly_camera import Firefly, Ramp, Source
-
 from drivers.bayer import Pattern
+from drivers.sim.firefly import Firefly, Ramps, Source
 
 STALL = -9  # LIBUSB_ERROR_PIPE: there is no such register
 _HEAD = struct.Struct("<BBHHH")  # of a control request: type, request, value, index, length
@@ -44,7 +43,7 @@ class FireflySocket:
         self._connections: set[socket.socket] = set()
         self._bulk: socket.socket | None = None
         self._buffers: list[int] = []  # lengths of those that the host has ready
-        self.camera = Firefly(self._send, source or Ramp(), pattern, absolute, point_grey)
+        self.camera = Firefly(self._send, source or Ramps(), pattern, absolute, point_grey)
         self.camera.unplug = self.unplug
 
     def __enter__(self) -> Self:
