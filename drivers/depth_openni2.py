@@ -42,37 +42,40 @@ class Options(Table):
     """The keys of `[depth]` beside `backend = "openni2"`.
 
     Attributes:
-        uri: The device, as the runtime lists it ("kinect1://A00366…", "1d27/0601@1/5",
+        device: Its URI, as the runtime lists it ("kinect1://A00366…", "1d27/0601@1/5",
             "virtual:///dev/shm/kinect"); "any" is the first that is connected.
-        serial: The device must have this serial number.
+        serial: It must have this serial number.
         file_path: An `.oni` recording to play back instead of a device: one exposure for each frame
             asked for, in the file's order, as if it were taken then.
         drivers: The driver plug-ins to load; by default those of Kinect v1 and of Xtion and Carmine,
-            or what `uri` or `file_path` needs.
+            or what `device` or `file_path` needs.
         depth_unit: What the device is asked for, "1mm" or "100um". Frames hold whole millimetres in
             either case: tenths are rounded to the nearest, and end at 6.553 m.
         infrared: Whether the device must give IR images, too.
+        exposure_ms: How long an exposure lasts, where that is known: no device tells. Without it a frame
+            is held to be exposed for a whole frame period, and `exposure_s` of frames is None.
         latency_ms: From mid-exposure until the frame can be here at the earliest.
         latency_sd_ms: Half the interval in which that can be.
         pair_ms: Time stamps of one exposure's depth and IR differ by no more.
         frame_timeout_s: Silence for longer means that the device is mute.
     """
 
-    uri: Annotated[str, Field(min_length=1, max_length=255)] = ANY
+    device: Annotated[str, Field(min_length=1, max_length=255)] = ANY
     serial: str | None = None
     file_path: Path | None = None
     drivers: tuple[_Driver, ...] | None = None
     depth_unit: Literal["1mm", "100um"] = "1mm"
     infrared: Annotated[bool, Strict()] = True
+    exposure_ms: Annotated[float, Strict(), Field(gt=0, le=1000, allow_inf_nan=False)] | None = None
     latency_ms: _Milliseconds = 40.0
     latency_sd_ms: _Milliseconds = 20.0
     pair_ms: _Milliseconds = 5.0
-    frame_timeout_s: Positive = 1.0
+    frame_timeout_s: Positive = 2.0
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        if self.file_path is not None and (self.uri != ANY or self.serial is not None):
-            raise ValueError("file_path goes without uri and serial")
+        if self.file_path is not None and (self.device != ANY or self.serial is not None):
+            raise ValueError("file_path goes without device and serial")
         if self.drivers is not None and not self.drivers:
             raise ValueError("drivers is empty; leave it out for the usual ones")
         return self
@@ -84,7 +87,7 @@ class Options(Table):
             return self.drivers
         if self.file_path is not None:
             return ("OniFile",)
-        return ("virtual",) if self.uri.startswith(_VIRTUAL) else ("kinect1", "PS1080")
+        return ("virtual",) if self.device.startswith(_VIRTUAL) else ("kinect1", "PS1080")
 
 
 def depth(
@@ -122,6 +125,7 @@ class OpenNI2Camera:
 
     def __init__(self, name: str, clock: Clock, options: Options) -> None:
         self._name, self._clock, self._options = name, clock, options
+        self._exposure_s = None if options.exposure_ms is None else options.exposure_ms / 1e3
         self._runtime: Runtime | None = None
         self._streams: Streams | None = None
         self._source: Reader | Playback | None = None
@@ -222,9 +226,8 @@ class OpenNI2Camera:
     def grab(self, not_before_ns: int, timeout_s: float, with_ir: bool = False) -> DepthFrame:
         """Returns the first exposure that certainly began at or after `not_before_ns`.
 
-        How long one lasts the device does not tell: a frame period, at the most. `t_sd_ns` is by
-        `latency_sd_ms` and by what its clock is not yet known to. Depth from tenths of a millimetre
-        is rounded to whole ones.
+        `t_sd_ns` is by `latency_sd_ms` and by what its clock is not yet known to. Depth from tenths of
+        a millimetre is rounded to whole ones.
 
         Raises:
             InputError: If the timeout is not above 0 and finite.
@@ -241,7 +244,7 @@ class OpenNI2Camera:
             raise DeviceFaultError(self._name, "IR is asked for, but options say infrared = false")
         with driver_errors(self._name):
             mode = streams.depth.mode
-            half_ns = 500_000_000 // max(1, mode.fps)
+            half_ns = round(5e8 * (self._exposure_s or 1 / max(1, mode.fps)))
             deadline_ns = max(not_before_ns, self._clock.now_ns()) + round(timeout_s * 1e9)
             if isinstance(source, Playback):
                 pair, t_ns, t_sd_ns = self._played(source, not_before_ns, half_ns, timeout_s)
@@ -254,7 +257,7 @@ class OpenNI2Camera:
                     )
                 pair, t_ns, t_sd_ns = timed.pair, timed.t_ns, timed.t_sd_ns
             depth_mm = whole_millimetres(pair.depth, unit_um(mode.pixel_format))
-        return DepthFrame(t_ns, pair.index, None, depth_mm, pair.ir if with_ir else None, t_sd_ns)
+        return DepthFrame(t_ns, pair.index, self._exposure_s, depth_mm, pair.ir if with_ir else None, t_sd_ns)
 
     def __enter__(self) -> Self:
         self.open()
@@ -268,7 +271,7 @@ class OpenNI2Camera:
     def _open_source(self, runtime: Runtime) -> Reader | Playback:
         options = self._options
         pair_us = round(options.pair_ms * 1000)
-        uri = options.uri if options.file_path is None else str(options.file_path)
+        uri = options.device if options.file_path is None else str(options.file_path)
         wanted = _FORMATS[options.depth_unit] if options.file_path is None else None
         self._streams = open_streams(runtime, uri, options.serial, wanted, options.infrared)
         if options.file_path is not None:
@@ -338,7 +341,7 @@ def record_oni(
         runtime = Runtime((*checked.plugins, "OniFile"))
         try:
             unit, pair_us = _FORMATS[checked.depth_unit], round(checked.pair_ms * 1000)
-            source = checked.uri, checked.serial
+            source = checked.device, checked.serial
             return record(runtime, *source, unit, path.absolute(), exposures, timeout_s, pair_us)
         finally:
             runtime.close()

@@ -86,14 +86,16 @@ def main(arguments: list[str] | None = None) -> int:
     """Builds all plug-ins, or those named; 0 if all are current then, 69 if one cannot be built."""
     parser = argparse.ArgumentParser(prog="python -m drivers.openni2.build", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="PLUGIN", help=f"of {', '.join(OWN)}; default: all")
-    names = parser.parse_args(arguments).names or OWN
+    parser.add_argument("--quiet", action="store_true", help="say nothing unless one cannot be built")
+    chosen = parser.parse_args(arguments)
+    names = chosen.names or OWN
     unknown = sorted(set(names) - set(OWN))
     if unknown:
         parser.error(f"no plug-in {', '.join(unknown)}; there are {', '.join(OWN)}")
     failed = False
     for name in names:
         try:
-            if build(name):
+            if build(name) and not chosen.quiet:
                 print(f"built {build_folder() / f'lib{name}.so.0'}")
         except PluginMissingError as error:
             print(f"OpenNI2 plug-in {name}: {error}", file=sys.stderr)

@@ -89,7 +89,7 @@ class FrameStream : public oni::driver::StreamBase {
       case ONI_STREAM_PROPERTY_VIDEO_MODE: return give(mode_, data, size);
       case ONI_STREAM_PROPERTY_HORIZONTAL_FOV: return give(fov_.horizontal, data, size);
       case ONI_STREAM_PROPERTY_VERTICAL_FOV: return give(fov_.vertical, data, size);
-      case ONI_STREAM_PROPERTY_MAX_VALUE: return give(max_value_, data, size);
+      case ONI_STREAM_PROPERTY_MAX_VALUE: return give(max_value(), data, size);
       case ONI_STREAM_PROPERTY_MIN_VALUE: return give(0, data, size);
       case ONI_STREAM_PROPERTY_STRIDE: return give(stride(), data, size);
       case ONI_STREAM_PROPERTY_CROPPING: return give(whole(), data, size);
@@ -127,7 +127,7 @@ class FrameStream : public oni::driver::StreamBase {
     raise(ONI_STREAM_PROPERTY_HORIZONTAL_FOV, fov_.horizontal);
     raise(ONI_STREAM_PROPERTY_VERTICAL_FOV, fov_.vertical);
     raise(ONI_STREAM_PROPERTY_MIRRORING, mirrored());
-    raise(ONI_STREAM_PROPERTY_MAX_VALUE, max_value_);
+    raise(ONI_STREAM_PROPERTY_MAX_VALUE, max_value());
     raise(ONI_STREAM_PROPERTY_MIN_VALUE, 0);
   }
 
@@ -160,6 +160,8 @@ class FrameStream : public oni::driver::StreamBase {
   virtual OniBool mirrored() const = 0;
 
  private:
+  bool in_tenths() const { return mode_.pixelFormat == ONI_PIXEL_FORMAT_DEPTH_100_UM; }
+  int max_value() const { return in_tenths() ? 65535 : max_value_; }
   int stride() const { return mode_.resolutionX * static_cast<int>(sizeof(std::uint16_t)); }
   OniCropping whole() const { return OniCropping{FALSE, 0, 0, mode_.resolutionX, mode_.resolutionY}; }
 
@@ -171,7 +173,7 @@ class FrameStream : public oni::driver::StreamBase {
   // Sources count millimetres. In tenths of them 16 bits end at 6.5535 m; beyond there is no value.
   void write(std::uint16_t* to, const std::uint16_t* from) const {
     const int rows = mode_.resolutionY, columns = mode_.resolutionX;
-    const bool tenths = mode_.pixelFormat == ONI_PIXEL_FORMAT_DEPTH_100_UM;
+    const bool tenths = in_tenths();
     const bool turned = mirrored() != FALSE;
     if (!tenths && !turned) {
       std::memcpy(to, from, static_cast<std::size_t>(rows) * columns * sizeof *to);

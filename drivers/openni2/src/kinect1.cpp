@@ -1,6 +1,6 @@
 // OpenNI2 driver plug-in "kinect1": Kinect for Xbox 360 and for Windows (v1) through libfreenect.
 //
-// Depth in whole millimetres by the device's own tables, and the IR image of the same camera (10 bit); no
+// Depth in millimetres by the device's own tables (in tenths where asked: times ten), and the IR image of the same camera (10 bit); no
 // colour, because IR and colour are two formats of one USB stream. Time stamps are the device's, in µs
 // (its clock runs at 60 MHz and wraps at 32 bits). Mirroring and registration are off and stay off.
 //
@@ -42,8 +42,9 @@ const milliseconds EVENTS(20), LIST_POLL(500);
 const std::chrono::seconds CALL_TIMEOUT(5);
 const int DEVICE_DEAD = -1;  // of freenect_process_events_timeout; an interrupted wait is another number
 
-const OniVideoMode DEPTH_MODE = {ONI_PIXEL_FORMAT_DEPTH_1_MM, WIDTH, HEIGHT, FPS};
-const OniVideoMode INFRARED_MODE = {ONI_PIXEL_FORMAT_GRAY16, WIDTH, HEIGHT, FPS};
+const std::vector<OniVideoMode> DEPTH_MODES = {{ONI_PIXEL_FORMAT_DEPTH_1_MM, WIDTH, HEIGHT, FPS},
+                                               {ONI_PIXEL_FORMAT_DEPTH_100_UM, WIDTH, HEIGHT, FPS}};
+const std::vector<OniVideoMode> INFRARED_MODES = {{ONI_PIXEL_FORMAT_GRAY16, WIDTH, HEIGHT, FPS}};
 
 // Both streams' stamps on one scale that does not wrap. Which wrap a stamp belongs to, the host's clock
 // tells: a pause may be longer than the 72 s of one.
@@ -75,7 +76,7 @@ class KinectStream : public FrameStream {
   using Switch = std::function<bool(bool on)>;
 
   KinectStream(OniSensorType sensor, FieldOfView fov, Switch change)
-      : FrameStream(sensor, {sensor == ONI_SENSOR_DEPTH ? DEPTH_MODE : INFRARED_MODE}, fov,
+      : FrameStream(sensor, sensor == ONI_SENSOR_DEPTH ? DEPTH_MODES : INFRARED_MODES, fov,
                     sensor == ONI_SENSOR_DEPTH ? DEPTH_MAX : INFRARED_MAX),
         change_(std::move(change)) {}
 
@@ -265,8 +266,9 @@ class KinectDevice : public oni::driver::DeviceBase {
   freenect_device* const camera_;
   Worker& worker_;
   const FieldOfView fov_;
-  OniVideoMode modes_[2] = {DEPTH_MODE, INFRARED_MODE};
-  OniSensorInfo sensors_[2] = {{ONI_SENSOR_DEPTH, 1, &modes_[0]}, {ONI_SENSOR_IR, 1, &modes_[1]}};
+  std::vector<OniVideoMode> depth_modes_ = DEPTH_MODES, infrared_modes_ = INFRARED_MODES;
+  OniSensorInfo sensors_[2] = {{ONI_SENSOR_DEPTH, 2, depth_modes_.data()},
+                               {ONI_SENSOR_IR, 1, infrared_modes_.data()}};
   std::mutex mutex_;
   std::map<OniSensorType, std::shared_ptr<KinectStream>> streams_;
   std::map<OniSensorType, int> index_;
