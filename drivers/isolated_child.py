@@ -71,14 +71,14 @@ class DeviceServer:
         module, _, function = factory.partition(":")
         try:
             make = getattr(importlib.import_module(module), function)
+            self._device = make(name=self._name, clock=SystemClock(), options=options, shared={})
+            self._device.open()
         except ModuleNotFoundError as error:
             if error.name is None or error.name.split(".")[0] in ("drivers", "surfclass"):
                 raise
             raise DriverUnavailableError(
                 self._name, f"{module} needs the library {error.name!r}; install the package that has it"
             ) from error
-        self._device = make(name=self._name, clock=SystemClock(), options=options, shared={})
-        self._device.open()
 
     def _grab(self, not_before_ns: int, timeout_s: float, with_ir: bool) -> dict[str, Any]:
         from drivers.errors import DeviceFaultError

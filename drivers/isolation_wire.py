@@ -64,12 +64,16 @@ def decode(data: bytes) -> dict[str, Any]:
     if len(data) > MESSAGE_LIMIT_BYTES:
         raise WireError(f"a message of more than {MESSAGE_LIMIT_BYTES} bytes")
     try:
-        message = json.loads(data)
+        message = json.loads(data, parse_constant=_refuse)
     except (ValueError, RecursionError):
         raise WireError(f"no JSON: {data[:40]!r}") from None
     if not isinstance(message, dict):
         raise WireError(f"no JSON object: {data[:40]!r}")
     return message
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number")
 
 
 def receive(channel: socket.socket) -> dict[str, Any] | None:
