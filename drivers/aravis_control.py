@@ -68,7 +68,7 @@ class ControlThread:
 
     def __init__(self, name: str, period_s: float = 0.25, silence_s: float = 1.0) -> None:
         self.lost = ""
-        self._period_s, self._silence_ns = period_s, round(silence_s * 1e9)
+        self._period_s, self._silence_s = period_s, silence_s
         self._jobs: queue.Queue[_Job[Any] | None] = queue.Queue(1)  # its callers wait, one at a time
         self._look: Callable[[], str] | None = None
         self._release: Callable[[bool], None] | None = None
@@ -90,13 +90,17 @@ class ControlThread:
         """Takes note that the camera is gone; may be called from any thread."""
         self.lost = self.lost or how
 
-    def how_lost(self) -> str:
-        """Returns `lost`, after a look at how long a call has been waiting."""
+    def how_lost(self, silence_s: float | None = None) -> str:
+        """Returns `lost`, after a look at how long a call has been waiting.
+
+        Args:
+            silence_s: The longest that it may have; None: as the camera's own `silence_s`.
+        """
         since_ns = self._since_ns
         if self._look is not None and since_ns is not None:
-            silent_ns = time.monotonic_ns() - since_ns
-            if silent_ns > self._silence_ns:
-                self.mark_lost(f"it has not answered for {silent_ns / 1e9:.1f} s")
+            silent_s = (time.monotonic_ns() - since_ns) / 1e9
+            if silent_s > (self._silence_s if silence_s is None else silence_s):
+                self.mark_lost(f"it has not answered for {silent_s:.1f} s")
         return self.lost
 
     def call(self, what: Callable[[], T], until_ns: int) -> T:

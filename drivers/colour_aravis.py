@@ -35,6 +35,7 @@ T = TypeVar("T")
 
 _OPEN_S = 12.0  # a search takes 1 s, a description of 1 MB over GigE several
 _WARM_UP_S = 1.0
+_COMMAND_S = 0.3  # a camera that is there takes a command within milliseconds
 _SLICE_S = 0.05  # how long a loss goes unnoticed while a frame is waited for
 _log = logging.getLogger("surfclass.aravis")
 
@@ -258,7 +259,8 @@ class AravisCamera:
         try:
             return self._control.call(what, until_ns)
         except TimeoutError:
-            self._must_be_there()
+            if self._control.how_lost(_COMMAND_S):
+                self._lose()
             raise DeviceTimeoutError(self._name, "it did not take a command in time") from None
         except GenicamError as error:
             if not (error.gone or error.denied):
