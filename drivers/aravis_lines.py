@@ -31,8 +31,8 @@ def set_strobe(settings: Settings, line: str, options: AravisOptions) -> str:
     return f"strobe on {line}: {options.strobe_source}{', inverted' if options.strobe_inverted else ''}"
 
 
-def set_trigger(settings: Settings, trigger: str) -> str:
-    """Sets what begins an exposure, and returns that in words.
+def set_trigger(settings: Settings, trigger: str) -> None:
+    """Sets what begins an exposure.
 
     Raises:
         ConfigurationError, DeviceFaultError, GenicamError: As `aravis_settings.set_up`.
@@ -41,7 +41,7 @@ def set_trigger(settings: Settings, trigger: str) -> str:
     if trigger == "free":
         if camera.has("TriggerMode"):
             settings.make("TriggerMode", "Off")
-        return "runs freely"
+        return
     settings.need("trigger", "TriggerMode")
     source = "Software" if trigger == "software" else trigger
     if camera.has("TriggerSelector"):
@@ -53,4 +53,3 @@ def set_trigger(settings: Settings, trigger: str) -> str:
     if trigger != "software" and camera.has("TriggerActivation"):
         settings.make("TriggerActivation", "RisingEdge")
     settings.make("TriggerMode", "On")
-    return f"trigger {source}"

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from functools import partial
 
 from drivers.aravis_control import ControlThread
+from drivers.aravis_features import Settings
 from drivers.aravis_library import Camera, GenicamError, Library, Stream
+from drivers.aravis_lines import set_trigger
 from drivers.aravis_options import AravisOptions
 from drivers.aravis_settings import Setup, set_up
 from drivers.aravis_timing import Arrivals, Exposures, FrameCount
@@ -28,6 +30,7 @@ class Session:
     arrivals: Arrivals
     count: FrameCount
     facts: dict[str, str]
+    trigger: str  # what begins an exposure, as `AravisOptions.trigger`
     fresh: bool = True  # no frame has come since the acquisition was started
     unanswered: bool = False  # a trigger was sent and its frame not seen
     frames: int = 0
@@ -72,11 +75,42 @@ def connect(name: str, options: AravisOptions, clock: Clock, control: ControlThr
     )
     camera.execute("AcquisitionStart")
     width, height = setup.size
-    facts |= {"format": f"{setup.format.name}, {width} × {height}", "settings": setup.facts}
+    facts |= {
+        "format": f"{setup.format.name}, {width} × {height}",
+        "settings": f"trigger {options.trigger}; {setup.facts}",
+    }
     exposures = Exposures(
         name, setup.exposure_s, options.stamp_at == "exposure_end", options.trigger_latency_s
     )
-    return Session(camera, stream, setup, exposures, Arrivals(clock.now_ns), FrameCount(), facts)
+    return Session(
+        camera, stream, setup, exposures, Arrivals(clock.now_ns), FrameCount(), facts, setup.trigger
+    )
+
+
+def restart(session: Session) -> None:
+    """Stops and starts the camera, so that no exposure of before is under way or on its way.
+
+    Raises:
+        GenicamError: If it does not answer.
+    """
+    session.camera.execute("AcquisitionStop")
+    session.stream.drop_all()
+    session.camera.execute("AcquisitionStart")
+    session.count.restart()
+    session.fresh, session.unanswered = True, False
+
+
+def change_trigger(session: Session, name: str, trigger: str) -> None:
+    """Has exposures begun by something else from now on.
+
+    Raises:
+        ConfigurationError, DeviceFaultError, GenicamError: As `aravis_settings.set_up`.
+    """
+    if trigger != session.trigger:
+        session.camera.execute("AcquisitionStop")
+        session.trigger = trigger
+        set_trigger(Settings(session.camera, name), trigger)
+        restart(session)
 
 
 def _found(name: str, wanted: str | None, library: Library) -> str:

@@ -50,7 +50,8 @@ class Setup:
         exposure_s: Exposure time.
         exposure_feature: Where that was read, and its `exposure_value` there.
         gain_db: None where the camera does not tell it in dB.
-        facts: The settings in words.
+        facts: The settings in words, but for the trigger.
+        trigger: What begins an exposure now: the camera's software trigger wherever it has one.
     """
 
     format: Format
@@ -60,6 +61,7 @@ class Setup:
     exposure_value: float
     gain_db: float | None
     facts: str
+    trigger: str
 
 
 def set_up(camera: Camera, options: AravisOptions, device: str) -> Setup:
@@ -92,11 +94,14 @@ def set_up(camera: Camera, options: AravisOptions, device: str) -> Setup:
     gain_db = _set_gain(settings, options.gain_db)
     facts += [_set_white_balance(settings, options), _black_level(camera)]
     facts += [set_strobe(settings, line, options) for line in options.strobe_lines]
-    facts.append(set_trigger(settings, options.trigger))
+    first = options.trigger
+    if camera.has("TriggerSource") and "Software" in camera.choices("TriggerSource"):
+        first = "software"
+    set_trigger(settings, first)
     settings.look_again()
     gain = "gain in the camera's own steps" if gain_db is None else f"gain {gain_db:.2f} dB"
     described = "; ".join(fact for fact in [f"exposure {exposure / 1e3:.3f} ms", gain, *facts] if fact)
-    return Setup(pixel_format, size, exposure / 1e6, exposure_feature, exposure, gain_db, described)
+    return Setup(pixel_format, size, exposure / 1e6, exposure_feature, exposure, gain_db, described, first)
 
 
 def _choose_format(settings: Settings, name: str | None) -> Format:

@@ -17,7 +17,7 @@ from typing import Any, NoReturn, Self, TypeVar
 from drivers.aravis_control import ControlThread
 from drivers.aravis_library import Buffer, Camera, GenicamError
 from drivers.aravis_options import AravisOptions
-from drivers.aravis_session import Session, connect
+from drivers.aravis_session import Session, change_trigger, connect, restart
 from drivers.aravis_timing import Trigger
 from drivers.errors import (
     DeviceFaultError,
@@ -34,7 +34,7 @@ from surfclass.schema import validate
 T = TypeVar("T")
 
 _OPEN_S = 12.0  # a search takes 1 s, a description of 1 MB over GigE several
-_WARM_UP_S = 1.0
+_WARM_UP_FRAMES, _WARM_UP_S = 3, 1.0
 _COMMAND_S = 0.3  # a camera that is there takes a command within milliseconds
 _SLICE_S = 0.05  # how long a loss goes unnoticed while a frame is waited for
 _log = logging.getLogger("surfclass.aravis")
@@ -88,7 +88,7 @@ class AravisCamera:
         return self._session is not None
 
     def open(self) -> None:
-        """Finds the camera, sets it up and starts it; a software-triggered one takes a first frame.
+        """Finds the camera, sets it up and starts it, with a few frames to learn its clock from.
 
         Raises:
             ConfigurationError: If the camera cannot do what the options ask for.
@@ -103,8 +103,10 @@ class AravisCamera:
             self._session = self._control.call(
                 partial(connect, self._name, self._options, self._clock, self._control), until_ns
             )
-            if self._options.trigger == "software":
-                self._warm_up(self._session)
+            self._warm_up(self._session)
+            self._control.call(
+                partial(change_trigger, self._session, self._name, self._options.trigger), until_ns
+            )
         except (GenicamError, DeviceLostError) as error:
             self.close()
             raise DeviceNotFoundError(self._name, f"it went away while it was opened: {error}") from error
@@ -155,7 +157,7 @@ class AravisCamera:
             raise InputError(f"timeout {timeout_s} s, allowed is above 0 and finite")
         session = self._must_be_there()
         until_ns = max(not_before_ns, self._clock.now_ns()) + round(timeout_s * 1e9)
-        if self._options.trigger == "software":
+        if session.trigger == "software":
             while (ahead_ns := not_before_ns - self._clock.now_ns()) > 0:
                 self._clock.sleep(min(_SLICE_S, ahead_ns / 1e9))
                 self._must_be_there()
@@ -182,9 +184,7 @@ class AravisCamera:
 
     def _triggered(self, session: Session, until_ns: int) -> ColourFrame:
         if session.unanswered:  # its frame may still come, and would be taken for the next one
-            self._ask(partial(_restart, session.camera), until_ns)
-            session.count.restart()
-            session.fresh, session.unanswered = True, False
+            self._ask(partial(restart, session), until_ns)
         while True:
             session.stream.drop_all()
             session.arrivals.begin()
@@ -247,9 +247,14 @@ class AravisCamera:
         )
 
     def _warm_up(self, session: Session) -> None:
-        """Takes a frame: the first after a start may begin late, and the device's clock is not known yet."""
+        """Takes frames by software trigger, which says best how the device's clock goes.
+
+        The first after a start may begin late, too, as no other will.
+        """
+        until_ns = self._clock.now_ns() + round((session.setup.exposure_s + _WARM_UP_S) * 1e9)
         try:
-            self.grab(self._clock.now_ns(), session.setup.exposure_s + _WARM_UP_S)
+            for _ in range(_WARM_UP_FRAMES if session.trigger == "software" else 0):
+                self._triggered(session, until_ns)
         except DeviceTimeoutError as error:
             _log.warning("%s; waiting goes on when it is asked for one", error)
 
@@ -283,8 +288,3 @@ class AravisCamera:
     def _lose(self) -> NoReturn:
         assert self._control is not None
         raise DeviceLostError(self._name, self._control.lost)
-
-
-def _restart(camera: Camera) -> None:
-    camera.execute("AcquisitionStop")
-    camera.execute("AcquisitionStart")
