@@ -64,7 +64,7 @@ class ArmSession:
         self._device, self._options = device, options
         self._clock = ReplyClock(())
         self._controller = self._robot = self._variable = 0
-        self._ends: list[tuple[Function, int]] = []  # what has to be released, the last first
+        self._ends: list[tuple[Function, tuple[Variant, ...]]] = []  # calls that release what there is
 
     def begin(self) -> None:
         """Starts the service, gets the arm's handle, and finds out how the joints are read.
@@ -77,14 +77,14 @@ class ArmSession:
             client.call(Function.SERVICE_START, *([bstr(options.service)] if options.service else []))
             names = (options.controller, options.provider, options.machine, options.option)
             self._controller = client.handle(Function.CONTROLLER_CONNECT, *map(bstr, names))
-            self._ends.append((Function.CONTROLLER_DISCONNECT, self._controller))
+            self._ends.append((Function.CONTROLLER_DISCONNECT, (i4(self._controller),)))
             arm = i4(self._controller), bstr(options.robot), bstr("")
             self._robot = client.handle(Function.CONTROLLER_GET_ROBOT, *arm)
-            self._ends.append((Function.ROBOT_RELEASE, self._robot))
+            self._ends.append((Function.ROBOT_RELEASE, (i4(self._robot),)))
             if not self._has_stamps():
                 variable = i4(self._robot), bstr(_ANGLES), bstr("")
                 self._variable = client.handle(Function.ROBOT_GET_VARIABLE, *variable)
-                self._ends.append((Function.VARIABLE_RELEASE, self._variable))
+                self._ends.append((Function.VARIABLE_RELEASE, (i4(self._variable),)))
                 self.command = _ANGLES
         except CallRefusedError as error:
             raise client.refusal(error, self._controller or None) from error
@@ -116,14 +116,13 @@ class ArmSession:
         """Releases what the controller holds for us, if it answers, and closes the link; never raises."""
         self.client.cancelled.clear()
         deadline_s = time.monotonic() + _END_S
-        try:
-            while self._ends:
-                function, handle = self._ends.pop()
+        with contextlib.suppress(DriverError):
+            for function, args in [*reversed(self._ends), (Function.SERVICE_STOP, ())]:
+                if self.client.mute:
+                    break
                 with contextlib.suppress(CallRefusedError):
-                    self.client.call(function, i4(handle), within_s=deadline_s - time.monotonic())
-            self.client.call(Function.SERVICE_STOP, within_s=max(0.0, deadline_s - time.monotonic()))
-        except (CallRefusedError, DriverError):
-            # It is gone or mute. Over UDP a session would linger: it may hear what it does not answer.
+                    self.client.call(function, *args, within_s=deadline_s - time.monotonic())
+        if self.client.mute:  # it may hear what it does not answer; over UDP the session would linger
             with contextlib.suppress(DriverError):
                 self.client.notify(Function.SERVICE_STOP)
         self.link.close()

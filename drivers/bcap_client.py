@@ -72,11 +72,13 @@ class BcapClient:
         repeated: Attempts that were not the first.
         late: Replies to no call that is under way: duplicates, and those that came too late.
         busy: How often the controller said that it is busy.
+        mute: Whether the last call got no answer.
     """
 
     def __init__(self, device: str, link: Link, *, timeout_s: float, retries: int, patience_s: float) -> None:
         self.cancelled = threading.Event()
         self.repeated = self.late = self.busy = 0
+        self.mute = False
         self._device, self._link = device, link
         self._timeout_s, self._patience_s = timeout_s, patience_s
         self._attempts = retries if link.repeats else 1
@@ -167,6 +169,7 @@ class BcapClient:
             reply = self._reply(serials, deadline_ns)
             if reply is None:
                 continue
+            self.mute = False
             came_ns, result = time.monotonic_ns(), unsigned(reply.code)
             if result == Result.E_ROBOTISBUSY:
                 return None
@@ -176,15 +179,16 @@ class BcapClient:
         if self._link.is_amid_packet():
             message = f"{self._link.address}: half a packet came, and no more for {self._timeout_s:g} s"
             raise DeviceLostError(self._device, message)
+        self.mute = True
         raise self._timeout(f"no answer to {function.name} within {self._timeout_s:g} s")
 
     def _reply(self, serials: set[int], deadline_ns: int) -> Packet | None:
         """Returns the reply to this call, or None if the controller is silent for one attempt's time."""
-        silence_ns = _ns(self._timeout_s / self._attempts)
-        until_ns = time.monotonic_ns() + silence_ns
+        until_ns = time.monotonic_ns() + _ns(self._timeout_s / self._attempts)
         while True:
             now_ns = time.monotonic_ns()
             if now_ns >= deadline_ns:
+                self.mute = True
                 raise self._timeout("no answer in time")
             if now_ns >= until_ns:
                 return None
@@ -196,8 +200,8 @@ class BcapClient:
             if packet.serial not in serials:
                 self.late += 1
             elif unsigned(packet.code) in (Result.S_EXECUTING, Result.E_BUSY_PROC):
-                self.busy += 1
-                until_ns = time.monotonic_ns() + silence_ns
+                self.busy += 1  # it has the call: sending it again is of no use for now
+                until_ns = time.monotonic_ns() + _ns(self._timeout_s)
             else:
                 return packet
 

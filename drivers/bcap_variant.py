@@ -110,11 +110,10 @@ def to_bytes(variant: Variant, depth: int = 0) -> bytes:
         if isinstance(value, tuple):
             if kind in _NOTHING:
                 raise PacketError(f"an array of {kind.name}")
-            items = b"".join(_item(kind, item, depth) for item in value)
-            return _HEAD.pack(kind | _ARRAY, len(value)) + items
+            return _HEAD.pack(kind | _ARRAY, len(value)) + _items(kind, value, depth)
         if kind is Type.VARIANT:
             raise PacketError("a VARIANT that is no array")
-        return _HEAD.pack(kind, 1) + _item(kind, value, depth)
+        return _HEAD.pack(kind, 1) + _items(kind, (value,), depth)
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
         raise PacketError(f"{value!r:.80} does not fit {kind.name}: {error}") from error
 
@@ -132,27 +131,35 @@ def from_bytes(data: bytes) -> Variant:
     return variant
 
 
-def _item(kind: Type, value: Scalar | Variant, depth: int) -> bytes:
+def _items(kind: Type, values: tuple[Scalar | Variant, ...], depth: int) -> bytes:
+    for value in values:
+        if not _fits(kind, value):
+            raise PacketError(f"{value!r:.80} is no {kind.name}")
     if kind in _NOTHING:
-        fits = value is None
-    elif kind is Type.VARIANT:
-        fits = isinstance(value, Variant)
-    elif kind is Type.BSTR:
-        fits = isinstance(value, str)
-    elif kind is Type.BOOL:
-        fits = isinstance(value, bool)
-    else:
-        fits = isinstance(value, int | float) and not isinstance(value, bool)
-    if not fits:
-        raise PacketError(f"{value!r:.80} is no {kind.name}")
-    if isinstance(value, Variant):
-        return to_bytes(value, depth + 1)
-    if isinstance(value, str):
-        text = value.encode("utf-16-le")
-        return _LENGTH.pack(len(text)) + text
-    if value is None:
         return b""
-    return struct.pack("<" + _FORMATS[kind], -int(value) if kind is Type.BOOL else value)
+    if kind in _FORMATS:
+        numbers = [-1 if value is True else value for value in values]  # BOOL's; no other kind has a True
+        return struct.pack(f"<{len(numbers)}{_FORMATS[kind]}", *numbers)
+    return b"".join(
+        to_bytes(value, depth + 1) if isinstance(value, Variant) else _text(str(value)) for value in values
+    )
+
+
+def _fits(kind: Type, value: Scalar | Variant) -> bool:
+    if kind in _NOTHING:
+        return value is None
+    if kind is Type.VARIANT:
+        return isinstance(value, Variant)
+    if kind is Type.BSTR:
+        return isinstance(value, str)
+    if kind is Type.BOOL:
+        return isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _text(value: str) -> bytes:
+    text = value.encode("utf-16-le")
+    return _LENGTH.pack(len(text)) + text
 
 
 class _Reader:
