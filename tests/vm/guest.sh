@@ -16,7 +16,7 @@ $python -m pip install --quiet --disable-pip-version-check --no-index --no-deps 
   --root-user-action=ignore wheel/*.whl
 said "installed $($python -c 'import importlib.metadata as m; print("surfclass", m.version("surfclass"))')"
 
-export PYTHONPATH=/opt/vm/tests/vm PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
+export PYTHONPATH=/opt/vm/tests/vm:/opt/vm/tests/contract:/opt/vm/tests PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
 eval "arguments=($(cat arguments))"  # as the host quoted them
 status=0
 $python -m pytest -m "" -p only_here -p no:cacheprovider -o python_files="test_*.py guest_*.py" \

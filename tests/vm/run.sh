@@ -52,7 +52,7 @@ mkdir -p "$work/source" "$work/payload/wheel" "$work/host"
 # From a copy: a build leaves its folders in the tree that it builds.
 (cd "$root" && cp -r pyproject.toml README.md LICENSE surfclass drivers calibration daemon "$work/source/")
 "$python" -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$work/payload/wheel" "$work/source"
-(cd "$root" && tar -cf - --exclude=__pycache__ pyproject.toml systemd tests/contract tests/vm) | tar -C "$work/payload" -xf -
+(cd "$root" && tar -cf - --exclude=__pycache__ pyproject.toml systemd tests) | tar -C "$work/payload" -xf -
 printf '%q ' "$@" >"$work/payload/arguments"
 tar -C "$work/payload" -cf "$work/host/payload.tar" .
 
