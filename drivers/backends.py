@@ -17,6 +17,7 @@ KINDS = ("colour", "depth", "light", "arm")
 # yet; it raises ConfigurationError for options that it does not know.
 _TABLE = {
     ("colour", "sim"): "drivers.sim.backend:colour",
+    ("colour", "v4l2"): "drivers.colour_v4l2:colour",
     ("depth", "sim"): "drivers.sim.backend:depth",
     ("light", "sim"): "drivers.sim.backend:light",
     ("arm", "sim"): "drivers.sim.backend:arm",

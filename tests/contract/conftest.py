@@ -10,7 +10,7 @@ import pytest
 from bench import Backend, Bench
 
 # Each names a module beside this file with a list BACKENDS.
-BENCHES = ("bench_sim",)
+BENCHES = ("bench_sim", "bench_v4l2")
 
 
 def backends() -> list[Backend]:
