@@ -20,7 +20,7 @@ from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundErro
 from drivers.interfaces import Clock
 from drivers.isolation import IsolatedCamera
 from drivers.openni2.api import DeviceProperty, DeviceState, PixelFormat
-from drivers.openni2.errors import driver_error, driver_errors
+from drivers.openni2.errors import OpenNI2Error, driver_error, driver_errors
 from drivers.openni2.opening import ANY, Streams, open_streams
 from drivers.openni2.pairs import Pair, unit_um, whole_millimetres
 from drivers.openni2.playback import Playback
@@ -56,7 +56,7 @@ class Options(Table):
             is held to be exposed for a whole frame period, and `exposure_s` of frames is None.
         latency_ms: From mid-exposure until the frame can be here at the earliest.
         latency_sd_ms: Half the interval in which that can be.
-        pair_ms: Time stamps of one exposure's depth and IR differ by no more.
+        pair_ms: Time stamps of one exposure's depth and IR differ by no more; never by half a period.
         frame_timeout_s: Silence for longer means that the device is mute.
     """
 
@@ -169,14 +169,15 @@ class OpenNI2Camera:
         source, self._source = self._source, None
         streams, self._streams = self._streams, None
         runtime, self._runtime = self._runtime, None
-        if isinstance(source, Reader) and not source.close():
-            # Its thread is in the runtime, which would crash; whoever opens next is told that it is in use.
-            _log.error("%s: OpenNI2 does not come back; it is left as it is", self._name)
-            return
-        if streams is not None:
-            streams.device.close()
-        if runtime is not None:
-            runtime.close()
+        if isinstance(source, Reader):
+            source.close()
+        try:
+            if streams is not None:
+                streams.device.close()
+            if runtime is not None:
+                runtime.close()
+        except OpenNI2Error as error:  # nothing more can be done in this process
+            _log.error("%s: not closed: %s", self._name, error)
 
     def check(self) -> None:
         """Says what became of it.
@@ -243,7 +244,7 @@ class OpenNI2Camera:
         if with_ir and streams.infrared is None:
             raise DeviceFaultError(self._name, "IR is asked for, but options say infrared = false")
         with driver_errors(self._name):
-            mode = streams.depth.mode
+            mode = streams.depth_mode
             half_ns = round(5e8 * (self._exposure_s or 1 / max(1, mode.fps)))
             deadline_ns = max(not_before_ns, self._clock.now_ns()) + round(timeout_s * 1e9)
             if isinstance(source, Playback):
@@ -270,10 +271,10 @@ class OpenNI2Camera:
 
     def _open_source(self, runtime: Runtime) -> Reader | Playback:
         options = self._options
-        pair_us = round(options.pair_ms * 1000)
         uri = options.device if options.file_path is None else str(options.file_path)
         wanted = _FORMATS[options.depth_unit] if options.file_path is None else None
         self._streams = open_streams(runtime, uri, options.serial, wanted, options.infrared)
+        pair_us = min(round(options.pair_ms * 1000), 499_999 // max(1, self._streams.depth_mode.fps))
         if options.file_path is not None:
             playback = Playback(self._streams, pair_us)
             playback.start()

@@ -12,7 +12,8 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-from drivers.openni2.errors import OpenNI2Error
+from drivers.openni2.call_thread import CallThread, HungError
+from drivers.openni2.errors import HangingError, OpenNI2Error
 
 API_VERSION = 2002  # major × 1000 + minor
 MAX_TEXT = 256
@@ -180,8 +181,11 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 LIBRARY = "libOpenNI2.so.0"
 
 
+_CALL_S = 10.0  # no call takes long, but that for a wait, which says for how long
+
+
 class Api:
-    """The functions, typed; calls let other Python threads run meanwhile.
+    """The functions, typed, called in `call_thread`'s thread; other Python threads run meanwhile.
 
     Args:
         path: The library, under the path from which it is to look for `OpenNI2/Drivers`.
@@ -198,23 +202,62 @@ class Api:
             function = getattr(library, name)
             function.restype, function.argtypes = result, arguments
             self._functions[name] = function
+        self._thread = CallThread()
 
-    def call(self, name: str, *arguments: Any) -> Any:
-        """Returns what the function `oni<name>` returns."""
-        return self._functions[f"oni{name}"](*arguments)
+    def call(self, name: str, *arguments: Any, wait_s: float = 0.0) -> Any:
+        """Returns what the function `oni<name>` returns.
+
+        Args:
+            name: The function's.
+            arguments: As of C.
+            wait_s: How long it may wait by itself.
+
+        Raises:
+            HangingError: If it or an earlier call does not come back.
+        """
+        return self._run(name, self._functions[f"oni{name}"], arguments, wait_s)
 
     def must(self, what: str, name: str, *arguments: Any) -> None:
         """Calls a function that returns a status.
 
         Raises:
             OpenNI2Error: "`what`: …" with the status and the runtime's own words, unless it is OK.
+            HangingError: As `call`.
         """
-        status = self.call(name, *arguments)
-        if status != Status.OK:
-            raise self.error(what, status)
+        self.status(what, name, arguments, (Status.OK,))
 
-    def error(self, what: str, status: int) -> OpenNI2Error:
-        """Returns an error of the calling thread's last call."""
-        told: bytes = self.call("GetExtendedError") or b""
-        words = " ".join(told.decode(errors="replace").split())
-        return OpenNI2Error(what, status, words)
+    def status(
+        self,
+        what: str,
+        name: str,
+        arguments: tuple[Any, ...],
+        allowed: tuple[Status, ...],
+        wait_s: float = 0.0,
+    ) -> Status:
+        """Returns the status of such a function, one of those allowed.
+
+        Raises:
+            OpenNI2Error: As `must`.
+            HangingError: As `call`.
+        """
+        function, words = self._functions[f"oni{name}"], self._functions["oniGetExtendedError"]
+
+        def run() -> tuple[int, bytes]:
+            status = function(*arguments)
+            return status, b"" if status in allowed else words()  # the next call of anybody clears them
+
+        status, told = self._run(name, run, (), wait_s)
+        if status not in allowed:
+            raise OpenNI2Error(what, status, " ".join((told or b"").decode(errors="replace").split()))
+        return Status(status)
+
+    @property
+    def hangs(self) -> bool:
+        """Whether a call has not come back: then none ever will in this process."""
+        return self._thread.hangs
+
+    def _run(self, name: str, function: Any, arguments: tuple[Any, ...], wait_s: float) -> Any:
+        try:
+            return self._thread.call(function, *arguments, timeout_s=wait_s + _CALL_S)
+        except HungError:
+            raise HangingError(f"oni{name}", Status.ERROR, "the library does not come back") from None

@@ -274,15 +274,13 @@ class Device(_Object):
         handles = (c_void_p * len(streams))(*(stream.handle.value for stream in streams))
         place = c_int(-1)
         timeout_ms = max(0, round(timeout_s * 1e3))
-        status = self._api.call("WaitForAnyStream", handles, len(streams), byref(place), timeout_ms)
-        if status == Status.TIME_OUT:
-            return None
-        if status != Status.OK:
-            raise self._api.error("waiting for a frame", status)
-        return streams[place.value]
+        arguments = (handles, len(streams), byref(place), timeout_ms)
+        allowed = (Status.OK, Status.TIME_OUT)
+        status = self._api.status("waiting", "WaitForAnyStream", arguments, allowed, timeout_s)
+        return streams[place.value] if status == Status.OK else None
 
     def forget_wakeup(self) -> None:
-        """Takes back the wake-up that the last frame left for this thread: the next wait really waits.
+        """Takes back the wake-up that the last frame left, so that the next wait really waits.
 
         Waiting for no stream at all looks at nothing and asks the device for nothing.
         """
@@ -290,7 +288,11 @@ class Device(_Object):
         self._api.call("WaitForAnyStream", nothing, 1, byref(c_int()), 0)
 
     def close(self) -> None:
-        """Stops all streams, releases them, then the device; frames are copies. May be called twice."""
+        """Stops all streams, releases them, then the device; frames are copies. May be called twice.
+
+        Raises:
+            OpenNI2Error: If the library does not come back.
+        """
         streams, self._streams = self._streams, []
         for stream in streams:
             stream.stop()

@@ -22,6 +22,10 @@ class OpenNI2Error(Exception):
         self.status = status
 
 
+class HangingError(OpenNI2Error):
+    """A call of the library that does not come back; only ending the process helps."""
+
+
 class PluginMissingError(Exception):
     """A library or a plug-in is not there, or not as this version of the project needs it."""
 
@@ -45,6 +49,8 @@ def driver_error(name: str, error: BaseException) -> BaseException:
             return DriverUnavailableError(name, str(error))
         case GoneError():
             return DeviceLostError(name, "it was unplugged")
+        case HangingError():
+            return DeviceLostError(name, str(error))
         case OpenNI2Error() if error.status != _OUT_OF_FLOW:
             return DeviceNotFoundError(name, str(error))
         case SettingError() | BrokenError() | OpenNI2Error():

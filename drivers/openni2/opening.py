@@ -21,12 +21,14 @@ class Streams:
 
     Attributes:
         depth: The depth stream.
+        depth_mode: Its format.
         infrared: The IR stream, of the same size, or None.
         settings: What was found to hold, for people.
     """
 
     device: Device
     depth: Stream
+    depth_mode: Mode
     infrared: Stream | None
     settings: str
 
@@ -41,7 +43,7 @@ class Streams:
         Raises:
             OpenNI2Error: If the device does not tell.
         """
-        mode, fov = self.depth.mode, self.depth.field_of_view()
+        mode, fov = self.depth_mode, self.depth.field_of_view()
         words = [
             f"{mode.width} × {mode.height} at {mode.fps} Hz",
             f"depth in {unit_um(mode.pixel_format)} µm",
@@ -74,7 +76,7 @@ def open_streams(
         depth, infrared = _set_up(device, depth_format, with_ir)
         settings = [_registration_off(device)]
         settings += [_mirroring_off(stream) for stream in (depth, infrared) if stream is not None]
-        return Streams(device, depth, infrared, ", ".join(settings))
+        return Streams(device, depth, depth.mode, infrared, ", ".join(settings))
     except BaseException:
         device.close()
         raise

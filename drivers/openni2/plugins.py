@@ -48,10 +48,10 @@ def sources_digest(name: str) -> str:
 
 
 def built_of(path: Path) -> tuple[str, str] | None:
-    """Returns the digests of the sources and of the system's headers that a built plug-in carries."""
+    """Returns the digests of sources and system headers that a built plug-in carries; None: it is none."""
     try:
         mark = _MARK.search(path.read_bytes())
-    except FileNotFoundError:
+    except OSError:
         return None
     return None if mark is None else (mark[1].decode(), mark[2].decode())
 
@@ -73,7 +73,7 @@ def find(name: str) -> Path:
     path = build_folder() / f"lib{name}.so.0"
     built = built_of(path)
     if built is None:
-        raise PluginMissingError(f"the OpenNI2 plug-in {path} is not built; run: {BUILD}")
+        raise PluginMissingError(f"the OpenNI2 plug-in {path} is not built, or cannot be read; run: {BUILD}")
     if built[0] != sources_digest(name):
         raise PluginMissingError(f"the OpenNI2 plug-in {path} was built of another version; run: {BUILD}")
     return path

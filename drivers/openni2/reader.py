@@ -8,12 +8,12 @@ from collections import deque
 from dataclasses import dataclass
 
 from drivers.device_clock import DeviceClock
-from drivers.openni2.errors import BrokenError, GoneError, OpenNI2Error
+from drivers.openni2.errors import BrokenError, GoneError, HangingError, OpenNI2Error
 from drivers.openni2.opening import Streams
 from drivers.openni2.pairs import Pair, Pairing
 
 KEPT = 4  # exposures that nobody has asked for yet; the oldest goes first
-_WAIT_S = 0.1
+_WAIT_S = 0.05  # other calls have to wait for so long
 _JOIN_S = 1.0
 
 
@@ -45,7 +45,7 @@ class Reader:
         self._pairing = Pairing(streams.infrared is not None, pair_tolerance_us)
         self._changed = threading.Condition()  # guards all below, and the clock
         self._kept = deque[Pair](maxlen=KEPT)
-        self._broken: str | None = None
+        self._failure: Exception | None = None
         self._gone = self._ending = False
         self._arrived_ns = time.monotonic_ns()
         self._count = 0
@@ -61,15 +61,13 @@ class Reader:
             stream.start()
         self._thread.start()
 
-    def close(self) -> bool:
-        """Ends the reading; returns whether the thread is out of the runtime, so that it may be closed."""
+    def close(self) -> None:
+        """Ends the reading; never raises."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
-        if self._thread.ident is None:
-            return True
-        self._thread.join(_JOIN_S)
-        return not self._thread.is_alive()
+        if self._thread.ident is not None:
+            self._thread.join(_JOIN_S)  # longer only where the library hangs; then nobody gets through
 
     def disconnected(self) -> None:
         """Takes note that the device was unplugged; from any thread."""
@@ -82,7 +80,7 @@ class Reader:
         """Returns how long ago the last exposure came, or the streams were started.
 
         Raises:
-            GoneError, BrokenError: As the class says.
+            GoneError, BrokenError, HangingError: As the class says.
         """
         with self._changed:
             self._must_live()
@@ -97,7 +95,7 @@ class Reader:
             deadline_ns: CLOCK_MONOTONIC.
 
         Raises:
-            GoneError, BrokenError: As the class says.
+            GoneError, BrokenError, HangingError: As the class says.
         """
         with self._changed:
             while True:
@@ -130,8 +128,8 @@ class Reader:
     def _must_live(self) -> None:
         if self._gone:
             raise GoneError
-        if self._broken is not None:
-            raise BrokenError(self._broken)
+        if self._failure is not None:
+            raise self._failure
 
     def _run(self) -> None:
         streams, device = self._streams.all, self._streams.device
@@ -145,7 +143,7 @@ class Reader:
                     self._take(pair)
         except OpenNI2Error as error:
             with self._changed:
-                self._broken = str(error)
+                self._failure = error if isinstance(error, HangingError) else BrokenError(str(error))
                 self._changed.notify_all()
 
     def _take(self, pair: Pair) -> None:

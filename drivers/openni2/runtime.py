@@ -19,7 +19,7 @@ from typing import Any
 
 from drivers.openni2 import api, plugins
 from drivers.openni2.api import Api
-from drivers.openni2.errors import OpenNI2Error, PluginMissingError
+from drivers.openni2.errors import HangingError, OpenNI2Error, PluginMissingError
 
 _in_use = threading.Lock()
 _loaded: tuple[Api, Path] | None = None  # for the life of the process, as is the library's own state
@@ -47,6 +47,7 @@ class Runtime:
     Raises:
         PluginMissingError: If the library or a plug-in is missing or cannot be loaded.
         OpenNI2Error: If the runtime does not start, or is in use by something else in this process.
+        HangingError: If it hangs in this process.
     """
 
     def __init__(
@@ -55,6 +56,8 @@ class Runtime:
         on_disconnect: Callable[[str], None] | None = None,
         on_state: Callable[[str, int], None] | None = None,
     ) -> None:
+        if _loaded is not None and _loaded[0].hangs:
+            raise HangingError("OpenNI2", api.Status.ERROR, "the library hangs in this process")
         if not _in_use.acquire(blocking=False):
             raise OpenNI2Error("OpenNI2", api.Status.OUT_OF_FLOW, "another camera of this process uses it")
         self._callback: c_void_p | None = None
@@ -67,7 +70,11 @@ class Runtime:
         self._open = True
 
     def close(self) -> None:
-        """Stops listening and unloads the plug-ins; devices must be closed before. May be called twice."""
+        """Stops listening and unloads the plug-ins; devices must be closed before. May be called twice.
+
+        Raises:
+            OpenNI2Error: If the library does not come back; then it stays in use.
+        """
         if not self._open:
             return
         self._open = False

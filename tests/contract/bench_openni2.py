@@ -1,4 +1,4 @@
-"""The OpenNI2 driver on the real libOpenNI2, reading a virtual Kinect: in a process of its own, and in this one."""
+"""The OpenNI2 driver on the real libOpenNI2, reading a virtual Kinect: isolated, and in this process."""
 
 from __future__ import annotations
 

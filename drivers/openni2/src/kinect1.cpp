@@ -7,8 +7,9 @@
 // IR comes as 640 × 488 pixels. The middle 480 rows are kept: TO BE CONFIRMED ON HARDWARE with a
 // calibration board, as is the shift of a few pixels between IR and depth (the correlation window).
 //
-// One thread makes every call of libfreenect, which locks nothing. It runs while a device is open and
-// only then: the runtime calls shutdown() with the lock held that its hot-plug callbacks take.
+// While a device is open one thread makes every call of libfreenect, which locks nothing. It runs then and
+// only then: the runtime calls shutdown() with the lock held that its hot-plug callbacks take. It writes
+// no error messages: the runtime keeps those by thread, and must not meet one that has ended.
 
 #include "frame_stream.hpp"
 
@@ -300,6 +301,7 @@ class KinectDriver : public oni::driver::DriverBase {
     const std::string wanted = uri;
     if (worker_->call([this, device, wanted] { return (*device = open(wanted)) != nullptr; })) return *device;
     if (open_.empty()) worker_.reset();
+    getServices().errorLoggerAppend("%s: cannot be opened: unplugged, in use, or no permission", uri);
     return nullptr;
   }
 
@@ -343,17 +345,12 @@ class KinectDriver : public oni::driver::DriverBase {
       if (at->camera_serial != nullptr) found.insert(SCHEME + std::string(at->camera_serial));
     }
     if (listed > 0) freenect_free_device_attributes(first);
-    if (freenect_num_devices(context_) > static_cast<int>(found.size())) {
-      getServices().errorLoggerAppend(
-          "kinect1: a Kinect is plugged in that may not be opened: permissions (udev rule), or in use");
-    }
     return found;
   }
 
   KinectDevice* open(const std::string& uri) {
     freenect_device* camera = nullptr;
     if (freenect_open_device_by_camera_serial(context_, &camera, uri.c_str() + sizeof SCHEME - 1) < 0) {
-      getServices().errorLoggerAppend("%s: cannot be opened: unplugged, in use, or no permission", uri.c_str());
       return nullptr;
     }
     KinectDevice* device = new KinectDevice(uri, camera, *worker_);
