@@ -77,12 +77,15 @@ def kinect(
     rate_hz: Annotated[
         float, typer.Option("--rate-hz", help="Frames a second, if they can be rendered.")
     ] = 30.0,
+    latency_s: Annotated[
+        float, typer.Option("--latency-s", help="From an exposure until its frame is there.")
+    ] = 0.04,
     cell: CellOption = None,
 ) -> None:
     """Run a virtual Kinect, which OpenNI2 finds by its plug-in."""
     from daemon.emulators import run_kinect
 
-    raise typer.Exit(run_kinect(cell, memory, rate_hz))
+    raise typer.Exit(run_kinect(cell, memory, rate_hz, latency_s))
 
 
 @sim.command()

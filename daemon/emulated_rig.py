@@ -24,7 +24,9 @@ from surfclass.errors import InputError
 
 SOCKET, DEVICES, PIDS = "cell.sock", "devices.toml", "pids.json"
 CAMERA = "SIM01"
-KINECT_RATE_HZ = 4.0  # what two cores can render while the daemon has some of them left
+# What two cores can render while the daemon has some of them left.
+KINECT_RATE_HZ = 5.0
+KINECT_LATENCY_S = 0.2
 _READY_S = 60.0
 _STOP_S = 5.0
 _LOOK_S = 0.1
@@ -94,23 +96,19 @@ class Places:
     def commands(self) -> dict[str, list[str]]:
         """Each device's name and what `surfclass sim` is called with."""
         cell = ["--cell", str(self.socket)]
+        paced = ["--rate-hz", f"{KINECT_RATE_HZ:g}", "--latency-s", f"{KINECT_LATENCY_S:g}"]
         return {
             "light": ["led", *cell, "--link", str(self.folder / "led")],
             "arm": ["arm", *cell, "--port", str(self.port)],
-            "depth": [
-                "kinect",
-                *cell,
-                "--memory",
-                str(self.folder / "kinect"),
-                "--rate-hz",
-                f"{KINECT_RATE_HZ:g}",
-            ],
+            "depth": ["kinect", *cell, "--memory", str(self.folder / "kinect"), *paced],
             "colour": ["camera", *cell, "--serial", CAMERA],
         }
 
     def tables(self) -> str:
         """The devices' tables for a configuration."""
-        return _TABLES.format(folder=self.folder, port=self.port, camera=CAMERA)
+        return _TABLES.format(
+            folder=self.folder, port=self.port, camera=CAMERA, latency_ms=KINECT_LATENCY_S * 1e3
+        )
 
 
 class Emulator:
@@ -197,13 +195,16 @@ def _free_port() -> int:
 _TABLES = """\
 [colour]
 backend = "aravis"
-camera = "{camera}"
+serial = "{camera}"
+address = "127.0.0.1"
 exposure_us = 10000
 gain_db = 0.0
 
 [depth]
 backend = "openni2"
 device = "virtual://{folder}/kinect"
+exposure_ms = 10.0
+latency_ms = {latency_ms:.1f}
 
 [light]
 backend = "gardasoft"

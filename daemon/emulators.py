@@ -45,12 +45,12 @@ def run_arm(cell_socket: Path | None, host: str, port: int, serial_link: Path | 
         return _run(cell, arm, f"robot controller {model}: {places}")
 
 
-def run_kinect(cell_socket: Path | None, memory: Path, rate_hz: float) -> int:
+def run_kinect(cell_socket: Path | None, memory: Path, rate_hz: float, latency_s: float) -> int:
     """Runs a virtual Kinect, which OpenNI2 finds by its plug-in."""
     from drivers.sim.virtual_kinect import VirtualKinect
 
     with _cell(cell_socket, images=True) as cell:
-        kinect = VirtualKinect(cell, memory, fps=rate_hz)
+        kinect = VirtualKinect(cell, memory, fps=rate_hz, latency_s=latency_s)
         return _run(cell, kinect, f"virtual Kinect: {kinect.uri}")
 
 
@@ -64,7 +64,7 @@ def run_camera(cell_socket: Path | None, serial: str, address: str) -> int:
 
 @contextmanager
 def _cell(socket: Path | None, images: bool = False) -> Iterator[Cell]:
-    """The cell of `surfclass sim cell`, or one of its own, ready to give images at once if they are needed."""
+    """The cell of `surfclass sim cell`, or one of its own, with its textures made if it gives images."""
     if socket is None:
         made = host_cell()
         if images:
