@@ -20,7 +20,7 @@ _STAMPED = "HighCurJntEx"
 _ANGLES = "@CURRENT_ANGLE"
 # A controller that knows no HighCurJntEx says one of these.
 _UNKNOWN = (Result.E_INVALIDCOMMAND, Result.E_NOTIMPL, Result.E_INVALIDARG)
-_TRIAL_S = 0.12
+_TRIAL_S = 0.1
 _TRIAL_PAUSE_S = 0.008
 _END_S = 0.5  # all that taking leave may last
 

@@ -155,6 +155,7 @@ PACKETS = st.builds(
 
 
 @given(PACKETS, st.booleans())
+@settings(max_examples=60)
 def test_what_is_written_is_read(packet, crc):
     data = encode(packet, crc)
     assert decode(data, crc) == packet
@@ -184,7 +185,7 @@ def test_garbage_inside_a_good_frame_is_a_packet_or_refused(arguments, argc):
 
 
 @given(PACKETS, st.data())
-@settings(max_examples=150)
+@settings(max_examples=80)
 def test_a_changed_byte_is_never_more_than_a_refusal(packet, data):
     wire = bytearray(encode(packet))
     wire[data.draw(st.integers(0, len(wire) - 1))] ^= data.draw(st.integers(1, 255))
@@ -195,6 +196,7 @@ def test_a_changed_byte_is_never_more_than_a_refusal(packet, data):
 
 
 @given(PACKETS, st.data())
+@settings(max_examples=50)
 def test_the_crc_finds_every_changed_byte(packet, data):
     wire = bytearray(encode(packet, crc=True))
     wire[data.draw(st.integers(0, len(wire) - 1))] ^= data.draw(st.integers(1, 255))
@@ -203,6 +205,7 @@ def test_the_crc_finds_every_changed_byte(packet, data):
 
 
 @given(PACKETS, st.data())
+@settings(max_examples=50)
 def test_a_part_of_a_packet_is_no_packet(packet, data):
     wire = encode(packet)
     with pytest.raises(PacketError):

@@ -20,8 +20,8 @@ from typing import Literal, Self
 from drivers.sim.bcap_machine import BcapFaults, Call, Joints, Machine
 from drivers.sim.bcap_peer import HangUpError, Peer
 
-_TICK_S = 0.05  # how soon a thread notices that it is stopped
 _SEND_TIMEOUT_S = 1.0
+_PAUSE_S = 0.05  # on a serial line, within no request
 _IDLE_UDP_S = 10.0  # a UDP session that says nothing for so long makes room for another
 _READ_SIZE = 1 << 16
 
@@ -63,7 +63,7 @@ class BcapController:
         self.machine = Machine(cell, model, drift_ppm=drift_ppm)
         self.host, self.port = host, port
         self._udp, self._serial_link, self._max_sessions = udp, serial_link, max_sessions
-        self._stopping = threading.Event()
+        self._stop: Callable[[], None] = _not_started
         self._threads: list[threading.Thread] = []
         self._closing = contextlib.ExitStack()
         self._peers: list[Peer] = []
@@ -91,30 +91,31 @@ class BcapController:
         """
         self.stop()
         with contextlib.ExitStack() as made:
-            tcp = made.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
-            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            tcp.bind((self.host, self.port))
+            stop = _Stop()
+            made.callback(stop.close)
+            tcp, udp = _bound(self.host, self.port)
+            made.enter_context(tcp)
+            made.enter_context(udp)
             self.port = tcp.getsockname()[1]
             tcp.listen(16)
-            targets = [partial(self._accept, tcp)]
+            targets = [partial(self._accept, stop, tcp)]
             if self._udp:
-                udp = made.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                udp.bind((self.host, self.port))
-                targets.append(partial(self._serve_udp, udp))
+                targets.append(partial(self._serve_udp, stop, udp))
+            else:
+                udp.close()
             if self._serial_link is not None:
-                targets.append(partial(self._serve_line, _pty(made, self._serial_link)))
-            self._closing = made.pop_all()
+                targets.append(partial(self._serve_line, stop, _pty(made, self._serial_link)))
+            self._stop, self._closing = stop.set, made.pop_all()
         for target in targets:
             self._run(target)
 
     def stop(self) -> None:
         """Goes away with all its connections; may be called twice."""
-        self._stopping.set()
+        self._stop()
         while self._threads:
             self._threads.pop().join()
         self._closing.close()
         self._peers.clear()
-        self._stopping = threading.Event()
 
     def __enter__(self) -> Self:
         self.start()
@@ -130,35 +131,35 @@ class BcapController:
         self._threads.append(thread)
         thread.start()
 
-    def _peer(self, send: Callable[[bytes], None], transport: Literal["tcp", "udp", "serial"]) -> Peer:
-        peer = Peer(self.machine, send, self._stopping, self._has_room, transport)
+    def _peer(
+        self, stop: _Stop, send: Callable[[bytes], None], transport: Literal["tcp", "udp", "serial"]
+    ) -> Peer:
+        peer = Peer(self.machine, send, stop.event, self._has_room, transport)
         self._peers.append(peer)
         return peer
 
     def _has_room(self) -> bool:
         return self.open_sessions < self._max_sessions
 
-    def _accept(self, listener: socket.socket) -> None:
-        while not self._stopping.is_set():
-            if _readable(listener.fileno()):
-                connection, _ = listener.accept()
-                self._threads = [thread for thread in self._threads if thread.is_alive()]
-                self._run(partial(self._serve_tcp, connection))
+    def _accept(self, stop: _Stop, listener: socket.socket) -> None:
+        while stop.waits_for(listener.fileno()):
+            connection, _ = listener.accept()
+            self._threads = [thread for thread in self._threads if thread.is_alive()]
+            self._run(partial(self._serve_tcp, stop, connection))
 
-    def _serve_tcp(self, connection: socket.socket) -> None:
+    def _serve_tcp(self, stop: _Stop, connection: socket.socket) -> None:
         with connection:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.settimeout(_SEND_TIMEOUT_S)
-            peer = self._peer(connection.sendall, "tcp")
+            peer = self._peer(stop, connection.sendall, "tcp")
             buffer = bytearray()
             try:
-                while not self._stopping.is_set():
-                    if _readable(connection.fileno()):
-                        data = connection.recv(_READ_SIZE)
-                        if not data:
-                            return
-                        buffer += data
-                        peer.take(buffer)
+                while stop.waits_for(connection.fileno()):
+                    data = connection.recv(_READ_SIZE)
+                    if not data:
+                        return
+                    buffer += data
+                    peer.take(buffer)
             except HangUpError as error:
                 if error.reset:
                     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -167,37 +168,78 @@ class BcapController:
             finally:
                 self._peers.remove(peer)
 
-    def _serve_udp(self, made: socket.socket) -> None:
+    def _serve_udp(self, stop: _Stop, made: socket.socket) -> None:
         peers: dict[tuple[str, int], Peer] = {}
-        while not self._stopping.is_set():
-            if not _readable(made.fileno()):
-                continue
+        while stop.waits_for(made.fileno()):
             data, address = made.recvfrom(_READ_SIZE)
             if address not in peers:
                 for known in [known for known, peer in peers.items() if _is_over(peer)]:
                     self._peers.remove(peers.pop(known))
-                peers[address] = self._peer(partial(_send_to, made, address), "udp")
+                peers[address] = self._peer(stop, partial(_send_to, made, address), "udp")
             peers[address].take_datagram(data)
 
-    def _serve_line(self, master: int) -> None:
-        peer = self._peer(partial(_write, master), "serial")
-        buffer = bytearray()
-        while not self._stopping.is_set():
-            if _readable(master):
-                buffer += os.read(master, _READ_SIZE)
-                peer.take_serial(buffer)
-            else:
-                buffer.clear()  # a pause: what comes next is another request
+    def _serve_line(self, stop: _Stop, master: int) -> None:
+        peer = self._peer(stop, partial(_write, master), "serial")
+        buffer, heard_s = bytearray(), 0.0
+        while stop.waits_for(master):
+            if time.monotonic() - heard_s > _PAUSE_S:
+                buffer.clear()  # what comes now is another request
+            buffer += os.read(master, _READ_SIZE)
+            heard_s = time.monotonic()
+            peer.take_serial(buffer)
+
+
+def _not_started() -> None:
+    pass
+
+
+class _Stop:
+    """A flag that also wakes who waits for a file."""
+
+    def __init__(self) -> None:
+        self.event = threading.Event()
+        self._seen, self._raised = socket.socketpair()
+
+    def set(self) -> None:
+        """Stops everybody, for good."""
+        self.event.set()
+        self._raised.close()  # the other end is readable from now on, to all
+
+    def waits_for(self, number: int) -> bool:
+        """Returns True once a file can be read, and False once this is set."""
+        poll = select.poll()
+        for each in (number, self._seen.fileno()):
+            poll.register(each, select.POLLIN)
+        poll.poll()
+        return not self.event.is_set()
+
+    def close(self) -> None:
+        """Releases what it holds."""
+        self.set()
+        self._seen.close()
+
+
+def _bound(host: str, port: int) -> tuple[socket.socket, socket.socket]:
+    """Returns sockets of TCP and UDP that have the same port; for 0 one that is free in both."""
+    refused: list[OSError] = []
+    while len(refused) < (1 if port else 16):
+        tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tcp.bind((host, port))
+            udp.bind((host, tcp.getsockname()[1]))
+        except OSError as error:
+            tcp.close()
+            udp.close()
+            refused.append(error)
+        else:
+            return tcp, udp
+    raise refused[-1]
 
 
 def _is_over(peer: Peer) -> bool:
     return not peer.session.started or time.monotonic() - peer.heard_s > _IDLE_UDP_S
-
-
-def _readable(number: int) -> bool:
-    poll = select.poll()
-    poll.register(number, select.POLLIN)
-    return bool(poll.poll(_TICK_S * 1e3))
 
 
 def _send_to(made: socket.socket, address: tuple[str, int], data: bytes) -> None:
