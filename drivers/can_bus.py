@@ -27,7 +27,7 @@ _STAMPED = ("socketcan", "virtual")
 _LINUX_ERROR_FRAMES = ("socketcan", "gs_usb", "virtual")  # as in linux/can/error.h
 _ON_A_PORT = ("slcan", "serial", "robotell", "seeedstudio")
 _BUS_OFF, _RESTARTED, _CONTROLLER, _PASSIVE = 0x40, 0x100, 0x04, 0x30
-_WAIT_S = 0.05
+_WAIT_S = 0.02
 _POLL_S = 0.002  # between two looks at a bus without stamps: how well a frame's arrival is known
 _PRESENCE_NS = 100_000_000
 _SEND_S = 0.1
@@ -163,7 +163,7 @@ class CanBus:
             self._lock_file = None
 
     def receive(self) -> CanFrame | None:
-        """Returns the next wanted frame, or None if there was none for a moment (2 to 50 ms).
+        """Returns the next wanted frame, or None if there was none for a moment (2 to 20 ms).
 
         Raises:
             DeviceLostError: If the bus went away: unplugged, switched off, bus-off.
@@ -173,7 +173,8 @@ class CanBus:
             raise DeviceLostError(self.device, "the bus is not open")
         began_ns = time.monotonic_ns()
         try:
-            message = bus.recv(_WAIT_S if self.stamped else _POLL_S)
+            # recv() itself measures its timeout by the wall clock: one that is set back makes it wait on.
+            message, _ = bus._recv_internal(_WAIT_S if self.stamped else _POLL_S)
         except self._can.CanError as error:
             if not isinstance(error.__cause__, UnicodeDecodeError):
                 raise DeviceLostError(self.device, f"{self.address}: {error}") from error
@@ -252,6 +253,8 @@ class CanBus:
         except (ValueError, TypeError) as error:
             raise ConfigurationError(f"{where}: {error}") from error
         except self._can.CanError as error:
+            if isinstance(error.__cause__, ValueError) and not isinstance(error.__cause__, OSError):
+                raise ConfigurationError(f"{where}: {error}") from error
             raise DeviceNotFoundError(self.device, f"{self.address}: {error}") from error
         except OSError as error:
             if error.errno is None:  # as pcan says that its library is missing

@@ -155,7 +155,7 @@ class Layout:
             return None
         try:
             values = message.decode(data)
-        except (ValueError, KeyError, LookupError):  # a selector that the DBC does not know
+        except self._error:  # a selector that the DBC does not know
             return None
         if not isinstance(values, dict):
             return None
@@ -188,6 +188,7 @@ class Layout:
             database: Database = cantools.database.load_file(path, database_format="dbc")
         except (cantools.Error, OSError, ValueError, LookupError) as error:
             raise ConfigurationError(f"{self._where}: not a DBC file that can be read: {error}") from error
+        self._error = cantools.Error
         self.library = f"cantools {cantools.__version__}"
         return database
 
@@ -270,6 +271,7 @@ def _key(message: Message) -> tuple[int, bool]:
 
 def _not_among(name: str, known: Iterable[str], what: str) -> str:
     names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    by_lower = {each.lower(): each for each in names}
+    near = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    hint = f"; did you mean {by_lower[near[0]]!r}?" if near else ""
     return f"{name!r} is no {what}{hint} (there are: {', '.join(names)})"

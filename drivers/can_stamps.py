@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 _STAMP_NS = 1_000  # a float of seconds since 1970 has steps of 0.24 µs
 _SLACK_NS = 1_000_000  # a frame is stamped a moment before a reader can find it
-_OFFSETS = 4
+_OFFSETS = 16  # steps that frames still waiting can have seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +23,8 @@ class Arrivals:
     """Maps the stamps of a bus's frames, in their order, to host time.
 
     Linux keeps CLOCK_REALTIME at a constant distance from CLOCK_MONOTONIC but for steps: both follow
-    the same disciplined oscillator. So the distance is sampled at every reception; samples narrow it
-    down, and one that contradicts is a step. A frame that was stamped before a step and read after
+    the same disciplined oscillator. So the distance is sampled at every look at the bus; samples narrow
+    it down, and one that contradicts is a step. A frame that was stamped before a step and read after
     it is told by where its time would have to lie: not before the frames ahead of it, not after now.
     Where both distances fit, the span covers both; a stamp that fits neither is not used.
 
@@ -46,10 +46,12 @@ class Arrivals:
         self._earliest_ns = now_ns()
         self._offsets: list[Span] = []
         self._step_ns = 0
+        self._sample()
 
     def idle(self, t_ns: int) -> None:
         """Notes that at `t_ns` no frame waited to be read: what comes next has arrived since."""
         self._earliest_ns = max(self._earliest_ns, t_ns)
+        self._sample()
 
     def span(self, stamp_s: float | None) -> Span:
         """Returns when the frame arrived that has just been read.
@@ -57,7 +59,7 @@ class Arrivals:
         Args:
             stamp_s: Its reception in seconds of the wall clock; None where there is no such stamp.
         """
-        arrived_ns = self._now_ns() if stamp_s is None else self._sample()
+        arrived_ns = self._sample()
         begin_ns, end_ns = self._earliest_ns, arrived_ns
         if stamp_s is not None:
             spans = self._candidates(round(stamp_s * 1e9), arrived_ns)
@@ -67,12 +69,12 @@ class Arrivals:
             else:
                 self.refused += 1
         self._earliest_ns = max(self._earliest_ns, begin_ns)
-        if self._earliest_ns > self._step_ns:
-            del self._offsets[:-1]
         return Span(begin_ns, end_ns)
 
     def _candidates(self, wall_ns: int, arrived_ns: int) -> list[Span]:
         """The stamp by each distance of the clocks that it can have been taken with."""
+        if self._earliest_ns > self._step_ns:  # no frame from before the last step is left
+            del self._offsets[:-1]
         spans = [
             Span(wall_ns + offset.begin_ns - _STAMP_NS, wall_ns + offset.end_ns + _STAMP_NS)
             for offset in self._offsets

@@ -22,8 +22,8 @@ _NOT_AVAILABLE = -(1 << 23)
 _LATEST_FRAMES = 1000
 _JOIN_S = 2.0
 
-# missing: the last frame of each set. late: it comes `late_s` after the others. mixed: it carries the next
-# set's counter. duplicated: each frame comes twice. frozen: the counter stands still. short: frames lack
+# missing: the last frame of each set. late: it comes `late_s` after the others. mixed: it carries
+# another counter. duplicated: each frame comes twice. frozen: the counter stands still. short: frames lack
 # their last bytes. garbage: frames of other ids and of no sense. mute: nothing, no SYNC either.
 # impossible: joint 2 is 400°. unavailable: joint 5 says that it has no value.
 BridgeFault = Literal[
@@ -147,7 +147,7 @@ def joint_frames(q: Float64, counter: int, faults: frozenset[str] = frozenset())
         pair = b"".join(
             word.to_bytes(3, "little", signed=True) for word in words[2 * number : 2 * number + 2]
         )
-        ahead = number == 2 and "mixed" in faults
+        ahead = 100 if number == 2 and "mixed" in faults else 0
         frames.append((can_id, pair + bytes([0, (counter + ahead) % 256])))
     if "short" in faults:
         frames = [(can_id, data[:5]) for can_id, data in frames]

@@ -84,7 +84,7 @@ class CiaNodes:
         if "mute" in self.faults or frame.extended:
             return
         if frame.can_id == SYNC_ID:
-            self._answer_sync()
+            self._answer_sync(time.monotonic_ns())
         elif len(frame.data) == 8 or frame.can_id == 0:
             self._network.notify(frame.can_id, bytearray(frame.data), frame.span.end_ns / 1e9)
 
@@ -127,11 +127,11 @@ class CiaNodes:
     def _run(self, period_s: float) -> None:
         while not self._stop.wait(period_s):
             if "mute" not in self.faults:
+                t_ns = time.monotonic_ns()
                 self._answer(SYNC_ID, b"", False)
-                self._answer_sync()
+                self._answer_sync(t_ns)
 
-    def _answer_sync(self) -> None:
-        t_ns = time.monotonic_ns()
+    def _answer_sync(self, t_ns: int) -> None:
         for node in self._nodes:
             if node.nmt.state != "OPERATIONAL" or (node.id == 6 and "missing" in self.faults):
                 continue

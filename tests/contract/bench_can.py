@@ -169,7 +169,7 @@ BACKENDS = [
     Backend("CAN (virtual bus, CANopen)", by_canopen, {"arm": frozenset(_NODE_FAULTS)}),
     Backend("CAN (slcan on a pty)", by_slcan, {"arm": _BRIDGE | {"unplugged"}}),
     Backend(
-        f"CAN (SocketCAN, {VCAN})",
+        f"CAN (socketcan, {VCAN})",
         lambda folder: on_a_bus(folder, "socketcan", VCAN),
         {"arm": _BRIDGE | {"unplugged"}},
         missing=_NO_VCAN,
