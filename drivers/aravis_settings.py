@@ -135,6 +135,11 @@ def _set_region(
         camera.write(feature, 0)  # so that width and height have their whole range
     whole = [int(camera.bounds(feature)[1]) for feature in ("Width", "Height")]
     x, y, width, height = (0, 0, *whole) if region is None else region
+    if x + width > whole[0] or y + height > whole[1]:
+        raise ConfigurationError(
+            f"{settings.device}: region {x}, {y}, {width}, {height} leaves the {whole[0]} × {whole[1]} "
+            "pixels of this camera"
+        )
     wanted = {"Width": width, "Height": height, "OffsetX": x, "OffsetY": y}
     for feature, value in wanted.items():
         if feature in offsets or feature in ("Width", "Height"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -14,6 +14,9 @@ from surfclass.errors import InputError
 Pattern = Literal["RGGB", "GRBG", "GBRG", "BGGR"]
 PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
 BITS = (8, 10, 12, 14, 16)
+
+_REACH = 2  # of the kernels
+_STRIP_ROWS = 64  # even, and so few that what is between raw and RGB stays in the cache
 
 # PFNC's "p" formats are one little-endian stream of bits; GigE Vision's older "Packed" ones and MIPI's
 # (V4L2's SRGGB10P, SRGGB12P) keep the high 8 bits of each pixel in a byte of its own.
@@ -60,23 +63,16 @@ def demosaic(
         InputError: If the array, the pattern or the bits are none of these, or a value has more bits.
     """
     _check(raw, pattern, bits)
-    full_in, dtype, depth = _scale(bits)
-    wide = raw.astype(np.float32)
-    if np.iinfo(dtype).max != full_in:
-        wide *= np.float32(np.iinfo(dtype).max / full_in)
-    own = _rounded(wide, depth)
-    green, along, across, opposite = (
-        _rounded(cv2.filter2D(wide, -1, kernel, borderType=cv2.BORDER_REFLECT_101), depth)
-        for kernel in _kernels()
-    )
-    red_row, red_col = divmod(pattern.index("R"), 2)
-    planes = {"R": own.copy(), "G": own.copy(), "B": own}
-    for colour, row, col in (("R", red_row, red_col), ("B", 1 - red_row, 1 - red_col)):
-        plane = planes[colour]
-        for target, y, x in ((along, row, 1 - col), (across, 1 - row, col), (opposite, 1 - row, 1 - col)):
-            plane[y::2, x::2] = target[y::2, x::2]
-        planes["G"][row::2, col::2] = green[row::2, col::2]
-    return cast("NDArray[np.uint8] | NDArray[np.uint16]", cv2.merge([planes[c] for c in "RGB"]))
+    full_in, dtype, _ = _scale(bits)
+    height, width = raw.shape
+    padded = cv2.copyMakeBorder(raw, _REACH, _REACH, _REACH, _REACH, cv2.BORDER_REFLECT_101)
+    rgb: NDArray[Any] = np.empty((height, width, 3), dtype)
+    scale = np.float32(np.iinfo(dtype).max / full_in)
+    for row in range(0, height, _STRIP_ROWS):
+        rows = min(_STRIP_ROWS, height - row)
+        strip = np.multiply(padded[row : row + rows + 2 * _REACH], scale, dtype=np.float32)
+        cv2.merge(_planes(strip, pattern, bits), dst=rgb[row : row + rows])
+    return rgb
 
 
 def mosaic(rgb: NDArray[Any], pattern: Pattern) -> NDArray[Any]:
@@ -149,6 +145,24 @@ def _kernels() -> tuple[NDArray[np.float32], ...]:
     opposite = [[0, 0, -3, 0, 0], [0, 4, 0, 4, 0], [-3, 0, 12, 0, -3], [0, 4, 0, 4, 0], [0, 0, -3, 0, 0]]
     kernels = (green, along, np.transpose(along).tolist(), opposite)
     return tuple(np.array(kernel, np.float32) / np.float32(16) for kernel in kernels)
+
+
+def _planes(mosaic_rows: NDArray[np.float32], pattern: Pattern, bits: int) -> list[NDArray[Any]]:
+    """Red, green and blue of some rows, which begin like the pattern and have a border of `_REACH`."""
+    depth = _scale(bits)[2]
+    inside = (slice(_REACH, -_REACH),) * 2
+    own = _rounded(mosaic_rows, depth)[inside]
+    green, along, across, opposite = (
+        _rounded(cv2.filter2D(mosaic_rows, -1, kernel), depth)[inside] for kernel in _kernels()
+    )
+    planes = {colour: own.copy() for colour in "RGB"}
+    red_row, red_col = divmod(pattern.index("R"), 2)
+    for colour, row, col in (("R", red_row, red_col), ("B", 1 - red_row, 1 - red_col)):
+        plane = planes[colour]
+        for target, y, x in ((along, row, 1 - col), (across, 1 - row, col), (opposite, 1 - row, 1 - col)):
+            plane[y::2, x::2] = target[y::2, x::2]
+        planes["G"][row::2, col::2] = green[row::2, col::2]
+    return list(planes.values())
 
 
 def _rounded(values: NDArray[Any], depth: int) -> NDArray[Any]:

@@ -71,6 +71,15 @@ def test_a_smooth_image_comes_back_within_a_two_hundredth_of_full_scale(pattern,
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_part_of_the_mosaic_gives_that_part_of_the_image(pattern):
+    raw = np.random.default_rng(3).integers(0, 65536, (301, 9)).astype(np.uint16)
+    whole = demosaic(raw, pattern, 16)
+    for first in (30, 60, 62, 64, 66, 126, 250):  # rows of the same pattern as row 0
+        part = demosaic(raw[first : first + 9], pattern, 16)
+        assert np.array_equal(part[2:-2], whole[first + 2 : first + 7])
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
 def test_each_pixel_keeps_its_own_raw_value_at_its_place(pattern):
     raw = np.random.default_rng(1).integers(0, 256, (10, 14)).astype(np.uint8)
     assert np.array_equal(mosaic(demosaic(raw, pattern, 8), pattern), raw)

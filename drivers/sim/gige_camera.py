@@ -39,6 +39,7 @@ _GAMMA_ENABLE, _GAMMA, _SHARPENING, _SATURATION, _REVERSE_X, _REVERSE_Y = (
 _CLIENT_TRIGGER_SOURCE, _LINE_MODE, _LINE_SOURCE, _FIRMWARE = 0x8040, 0x8060, 0x8070, 0x80A0
 _SOFTWARE, _OUTPUT, _EXPOSURE_ACTIVE, _CONTINUOUS = 1, 1, 1, 2
 _BAYER_RG8 = 0x01080009
+_ON_FOR_NS = 3_600_000_000_000  # at start: its clock can be set back
 
 
 class ColourCell(Protocol):
@@ -96,7 +97,7 @@ class GigeCamera:
         """
         if self._camera is None:
             self._ending.clear()
-            self._frozen_at_ns, self._on_ns = None, time.monotonic_ns()
+            self._frozen_at_ns, self._on_ns = None, time.monotonic_ns() - _ON_FOR_NS
             self._camera = FakeCamera(self._address, self._serial, FEATURES, self._expose)
             self.power_cycle()
 

@@ -142,7 +142,9 @@ class FakeCamera:
         # The buffer's own idea of its size is 0 until it is filled; it was allocated for its format.
         size = width * height * (code >> 16 & 0xFF) // 8
         data = self._library.arv_buffer_get_data(buffer, byref(c_size_t()))
-        np.ctypeslib.as_array((c_uint8 * size).from_address(data))[:] = content[:size]
+        target = np.ctypeslib.as_array((c_uint8 * size).from_address(data))
+        target[: content.size] = content[:size]
+        target[content.size :] = 0  # of a region that leaves the sensor
 
 
 def _loaded() -> Any:
