@@ -27,7 +27,7 @@ from surfclass.frames import ColourFrame, DepthFrame
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
-    max_leaves=12,
+    max_leaves=6,
 )
 PLACES = st.fixed_dictionaries(
     {
