@@ -243,13 +243,15 @@ class IidcCamera:
             raise SetupError(f"mode {options.mode}: the camera tells no frame rate; give readout_max_s")
         camera.call("capture_setup", options.buffers, CAPTURE_FLAGS_DEFAULT)
         self._capturing = True
-        self._stream = IidcStream(camera, options.buffers, self._clock)
+        readout_s = options.readout_max_s or self._exposure.period_s or 0.0
+        self._stream = IidcStream(camera, readout_s, self._clock)
         camera.call("video_set_transmission", 1)
 
     def _triggered(self, camera: Camera, stream: IidcStream, begin_ns: int, deadline_ns: int) -> ColourFrame:
         """Triggers at `begin_ns`, and again where the frame comes damaged or is lost."""
         self._outwait_late_frame(stream, deadline_ns)
         stream.rest_until(begin_ns)
+        damaged = 0
         while True:
             while camera.number("software_trigger_get_power"):  # busy with an exposure
                 self._before(deadline_ns, "the camera was not ready for a trigger")
@@ -262,14 +264,12 @@ class IidcCamera:
                 if arrival.at_ns - sent_ns >= self._least_ns():
                     break
                 self._unasked += 1  # its exposure cannot have begun after the trigger
-            if arrival is None:
-                self._before(deadline_ns, "no frame came in time")
-                self._late += 1
-                continue
-            self._due_ns = None
-            if arrival.image is not None:
-                return self._frame(arrival, arrival.image, sent_ns)
-            self._before(deadline_ns, "frames came damaged")
+            if arrival is not None:
+                self._due_ns = None
+                if arrival.image is not None:
+                    return self._frame(arrival, arrival.image, sent_ns)
+                damaged += 1
+            self._before(deadline_ns, "no frame came in time" + f" ({damaged} came damaged)" * bool(damaged))
 
     def _running(self, stream: IidcStream, not_before_ns: int, deadline_ns: int) -> ColourFrame:
         """Waits for an exposure that the camera or a line begins."""

@@ -56,7 +56,7 @@ _FRAME = POINTER(VideoFrame)
 _U32 = POINTER(c_uint32)
 
 # What the calls take besides the camera; each returns dc1394error_t.
-_CALLS: dict[str, Sequence[Any]] = {
+CALLS: dict[str, Sequence[Any]] = {
     "camera_get_platform_string": (POINTER(c_char_p),),
     "camera_get_node": (_U32, _U32),
     "camera_set_power": (c_int,),
@@ -114,7 +114,7 @@ class Library:
         self._on_log = _LogHandler(self._logged)
         for kind in (LOG_ERROR, LOG_WARNING):
             lib.dc1394_log_register_handler(c_int(kind), self._on_log, None)
-        for name, arguments in _CALLS.items():
+        for name, arguments in CALLS.items():
             getattr(lib, f"dc1394_{name}").argtypes = (_CAMERA, *arguments)
         lib.dc1394_new.restype = c_void_p
         lib.dc1394_free.argtypes = (c_void_p,)

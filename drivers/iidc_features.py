@@ -14,6 +14,7 @@ from drivers.dc1394_types import (
     TRIGGER_SOURCE_0,
     TRIGGER_SOURCE_SOFTWARE,
     Feature,
+    FeatureInfo,
 )
 from drivers.iidc_options import IidcOptions, SetupError
 
@@ -62,28 +63,24 @@ def set_exposure(camera: Camera, options: IidcOptions) -> Exposure:
         SetupError: If a value is outside what the camera can, or it does not keep one.
         Dc1394Error: If it does not answer.
     """
-    said = [_manual(camera, feature) for feature in _MANUAL]
-    period_s = _set_frame_rate(camera, options)
+    infos = {feature: info for feature in _MANUAL if (info := _manual(camera, feature)) is not None}
+    period_s = _set_frame_rate(camera, infos.get(Feature.FRAME_RATE), options)
     wanted_s = None if options.exposure_us is None else options.exposure_us / 1e6
     step_s = None if options.shutter_step_us is None else options.shutter_step_us / 1e6
     exposure_s, shutter = _set_value(
         camera,
-        Feature.SHUTTER,
+        infos.get(Feature.SHUTTER),
         _Wanted("exposure_us", wanted_s, "shutter_raw", options.shutter_raw, 1e6, 50e-6),
-        "shutter_step_us",
-        step_s,
-        options.shutter_offset_us / 1e6,
+        _Steps("shutter_step_us", step_s, options.shutter_offset_us / 1e6),
     )
     gain_db, gain = _set_value(
         camera,
-        Feature.GAIN,
+        infos.get(Feature.GAIN),
         _Wanted("gain_db", options.gain_db, "gain_raw", options.gain_raw, 1.0, 0.25),
-        "gain_step_db",
-        options.gain_step_db,
-        options.gain_offset_db,
+        _Steps("gain_step_db", options.gain_step_db, options.gain_offset_db),
     )
     if options.brightness_raw is not None:
-        _set_raw(camera, Feature.BRIGHTNESS, "brightness_raw", options.brightness_raw)
+        _set_raw(camera, infos.get(Feature.BRIGHTNESS), "brightness_raw", options.brightness_raw)
     if exposure_s is None:
         raise SetupError("the camera has no absolute shutter; give shutter_step_us from its manual")
     if exposure_s <= 0:
@@ -92,7 +89,11 @@ def set_exposure(camera: Camera, options: IidcOptions) -> Exposure:
         f"shutter {exposure_s * 1e3:.3f} ms ({shutter})",
         "gain " + (f"{gain_db:.2f} dB ({gain})" if gain_db is not None else gain),
         *([f"{1 / period_s:.3g} Hz"] if period_s is not None else []),
-        *(text for text in said if text),
+        *(
+            f"{_name(feature)} {'cannot be switched off' if info.is_on else 'off'}"
+            for feature, info in infos.items()
+            if feature in _OFF
+        ),
     ]
     return Exposure(exposure_s, gain_db, period_s, ", ".join(parts))
 
@@ -168,36 +169,34 @@ def set_registers(camera: Camera, options: IidcOptions) -> None:
             raise SetupError(f"registers.{offset}: the camera kept {kept:#010x}, not {value:#010x}")
 
 
-def _manual(camera: Camera, feature: Feature) -> str:
-    """Takes a feature out of its automatic mode, and switches it on or off; returns what is left of it."""
+def _manual(camera: Camera, feature: Feature) -> FeatureInfo | None:
+    """Takes a feature out of its automatic mode, and switches it on or off; None if there is none."""
     info = camera.feature(feature)
     if not info.available:
-        return ""
+        return None
     if MANUAL in info.modes.modes[: info.modes.num]:
         camera.call("feature_set_mode", feature, MANUAL)
     switched = bool(info.on_off_capable) and feature in (*_ON, *_OFF)
     if switched:
         camera.call("feature_set_power", feature, int(feature in _ON))
     info = camera.feature(feature)
-    name = feature.name.lower().replace("_", " ")
     off, automatic = switched and not info.is_on, info.current_mode != MANUAL
     if (automatic and not off) or (switched and off == (feature in _ON)):
         state = "automatic" if automatic and not off else "off" if off else "on"
-        raise SetupError(f"{name}: it stays {state}, though it was told otherwise")
-    if feature in _OFF:
-        return f"{name} off" if off else f"{name} cannot be switched off"
-    return ""
+        raise SetupError(f"{_name(feature)}: it stays {state}, though it was told otherwise")
+    return info
 
 
-def _set_frame_rate(camera: Camera, options: IidcOptions) -> float | None:
+def _name(feature: Feature) -> str:
+    return feature.name.lower().replace("_", " ")
+
+
+def _set_frame_rate(camera: Camera, info: FeatureInfo | None, options: IidcOptions) -> float | None:
     """Sets the rate where that is a feature of its own, and returns the period."""
-    info = camera.feature(Feature.FRAME_RATE)
-    if not (info.available and info.absolute_capable):
+    if info is None or not info.absolute_capable:
         return None if options.format7 is not None else 1 / options.frame_rate_hz
-    _set_absolute(
-        camera, Feature.FRAME_RATE, _Wanted("frame_rate_hz", options.frame_rate_hz, "", None, 1.0, 0.01)
-    )
-    return 1 / float(camera.feature(Feature.FRAME_RATE).abs_value)
+    wanted = _Wanted("frame_rate_hz", options.frame_rate_hz, "", None, 1.0, 0.01)
+    return 1 / float(_set_absolute(camera, info, wanted).abs_value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,35 +220,42 @@ class _Wanted:
     slack: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """What the manual says of a register: its unit in s or dB, and what 0 is."""
+
+    option: str
+    step: float | None
+    offset: float
+
+
 def _set_value(
-    camera: Camera, feature: Feature, wanted: _Wanted, step_option: str, step: float | None, offset: float
+    camera: Camera, info: FeatureInfo | None, wanted: _Wanted, steps: _Steps
 ) -> tuple[float | None, str]:
     """Sets shutter or gain by whichever way there is; returns it in s or dB, and the register as text."""
-    info = camera.feature(feature)
-    if not info.available:
-        raise SetupError(f"{wanted.option}: the camera has no {feature.name.lower()} that can be set")
+    if info is None:
+        raise SetupError(f"{wanted.option}: the camera has no such feature that can be set")
     if wanted.value is not None and info.absolute_capable:
-        _set_absolute(camera, feature, wanted)
+        info = _set_absolute(camera, info, wanted)
     else:
         raw = wanted.raw
         if raw is None:
-            if step is None or wanted.value is None:
+            if steps.step is None or wanted.value is None:
                 raise SetupError(
-                    f"{wanted.option}: the camera has no absolute {feature.name.lower()}; "
-                    f"give {wanted.raw_option}, or {step_option} from its manual"
+                    f"{wanted.option}: the camera has no absolute {_name(Feature(info.id))}; "
+                    f"give {wanted.raw_option}, or {steps.option} from its manual"
                 )
-            raw = round((wanted.value - offset) / step)
+            raw = round((wanted.value - steps.offset) / steps.step)
         if info.absolute_capable:
-            camera.call("feature_set_absolute_control", feature, 0)
-        _set_raw(camera, feature, wanted.raw_option, raw)
-    info = camera.feature(feature)
+            camera.call("feature_set_absolute_control", info.id, 0)
+        info = _set_raw(camera, info, wanted.raw_option, raw)
     if info.absolute_capable:
         return float(info.abs_value), f"raw {info.value}"
-    return None if step is None else info.value * step + offset, f"raw {info.value}"
+    return None if steps.step is None else info.value * steps.step + steps.offset, f"raw {info.value}"
 
 
-def _set_absolute(camera: Camera, feature: Feature, wanted: _Wanted) -> None:
-    info, value, shown = camera.feature(feature), wanted.value, wanted.shown
+def _set_absolute(camera: Camera, info: FeatureInfo, wanted: _Wanted) -> FeatureInfo:
+    value, shown = wanted.value, wanted.shown
     assert value is not None
     least, most = float(info.abs_min), float(info.abs_max)
     rounding = 1e-6 * max(abs(least), abs(most))  # the register's numbers are of 32 bits
@@ -257,19 +263,21 @@ def _set_absolute(camera: Camera, feature: Feature, wanted: _Wanted) -> None:
         raise SetupError(
             f"{wanted.option} {value * shown:g}, the camera allows {least * shown:g} to {most * shown:g}"
         )
-    camera.call("feature_set_absolute_control", feature, 1)
-    camera.call("feature_set_absolute_value", feature, value)
-    info = camera.feature(feature)
+    camera.call("feature_set_absolute_control", info.id, 1)
+    camera.call("feature_set_absolute_value", info.id, value)
+    info = camera.feature(Feature(info.id))
     kept = float(info.abs_value)
     if not info.abs_control or abs(kept - value) > max(wanted.slack, _TOLERANCE * abs(value)):
         raise SetupError(f"{wanted.option} {value * shown:g}: the camera kept {kept * shown:g}")
+    return info
 
 
-def _set_raw(camera: Camera, feature: Feature, option: str, raw: int) -> None:
-    info = camera.feature(feature)
-    if not info.available or not info.min <= raw <= info.max:
-        allowed = f"allows {info.min} to {info.max}" if info.available else "has no such feature"
+def _set_raw(camera: Camera, info: FeatureInfo | None, option: str, raw: int) -> FeatureInfo:
+    if info is None or not info.min <= raw <= info.max:
+        allowed = "has no such feature" if info is None else f"allows {info.min} to {info.max}"
         raise SetupError(f"{option} {raw}, the camera {allowed}")
-    camera.call("feature_set_value", feature, raw)
-    if (kept := camera.feature(feature).value) != raw:
-        raise SetupError(f"{option} {raw}: the camera kept {kept}")
+    camera.call("feature_set_value", info.id, raw)
+    info = camera.feature(Feature(info.id))
+    if info.value != raw:
+        raise SetupError(f"{option} {raw}: the camera kept {info.value}")
+    return info

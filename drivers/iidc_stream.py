@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from drivers.dc1394 import Camera, Dc1394Error
 from drivers.interfaces import Clock
 
-_WAIT_MS = 50  # for a frame, before the thread looks whether it is to end
+_WAIT_S = 0.01  # for a frame; how late its time may be noticed at most
+_SETTLE_S = 0.02  # what the library takes at most from the kernel's frame to the ring, while it runs
 _STOP_S = 1.0  # a library call that has not returned then hangs
 _KEPT = 2  # frames that nobody has asked for yet; the oldest is dropped
 
@@ -20,11 +21,10 @@ class Arrival:
     """A frame as it came over the bus.
 
     Attributes:
-        after_ns: It was not here yet at this time; the bus gives no time of its own.
+        after_ns: Its transfer ended after this time; the bus gives no time of its own.
         at_ns: It was here at this time.
         sequence: Counts all frames that came, corrupt ones too.
-        image: Its bytes, or None for a frame that is corrupt: short, damaged, or waiting in the camera
-            while the ring was full.
+        image: Its bytes, or None for a frame that came short or damaged.
     """
 
     after_ns: int
@@ -40,18 +40,18 @@ class StreamEndedError(Exception):
 class IidcStream:
     """A thread that takes each frame out of the ring as it comes and gives its buffer back.
 
-    A USB camera has no memory for frames: where the ring is full the camera stalls, and its next frame
-    is one of before. So once as many frames came in a row as the ring has buffers, the one after them
-    is discarded.
+    Where this process did not run for a while, frames wait in the kernel, and once the ring is full one
+    more in the camera, and come later as if they were new. None of them is then said to be newer than
+    the last time at which the ring was surely empty.
 
     Args:
         camera: With its capture set up.
-        buffers: Of the ring.
+        readout_s: From an exposure's end until its frame is here, at most, while the ring has room.
         clock: The host's.
     """
 
-    def __init__(self, camera: Camera, buffers: int, clock: Clock) -> None:
-        self._camera, self._buffers, self._clock = camera, buffers, clock
+    def __init__(self, camera: Camera, readout_s: float, clock: Clock) -> None:
+        self._camera, self._readout_s, self._clock = camera, readout_s, clock
         self._changed = threading.Condition()
         self._arrived: deque[Arrival] = deque(maxlen=_KEPT)
         self._ended = ""
@@ -119,20 +119,21 @@ class IidcStream:
     def _drain(self) -> None:
         wait = select.poll()
         wait.register(self._camera.fileno(), select.POLLIN)
-        empty_ns, in_a_row = self._clock.now_ns(), 0
+        settle_ns, readout_ns = round(_SETTLE_S * 1e9), round(self._readout_s * 1e9)
+        begun_ns = empty_ns = trusted_ns = self._clock.now_ns()
         while not self._stop:
             before_ns = self._clock.now_ns()
+            if before_ns - begun_ns > round(_WAIT_S * 1e9) + settle_ns:  # it did not run meanwhile
+                trusted_ns = before_ns + settle_ns + readout_ns
+            begun_ns = before_ns
             image = self._camera.take()
             if image is None:
-                # A full ring is remembered: what the camera could not send then is still to come.
-                empty_ns, in_a_row = before_ns, in_a_row if in_a_row >= self._buffers else 0
-                wait.poll(_WAIT_MS)
+                if before_ns >= trusted_ns:
+                    empty_ns = before_ns - settle_ns
+                wait.poll(_WAIT_S * 1e3)
                 continue
-            stalled = in_a_row >= self._buffers
-            in_a_row = 0 if stalled else in_a_row + 1
             with self._changed:
-                whole = None if stalled or not image else image
-                self._arrived.append(Arrival(empty_ns, self._clock.now_ns(), self.frames, whole))
+                self._arrived.append(Arrival(empty_ns, self._clock.now_ns(), self.frames, image or None))
                 self.frames += 1
-                self.corrupt += whole is None
+                self.corrupt += not image
                 self._changed.notify_all()

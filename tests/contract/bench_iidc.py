@@ -22,6 +22,8 @@ from typing import Any
 from bench import Backend, Bench, Trouble
 
 from drivers.clock import SystemClock
+from drivers.colour_iidc import in_process
+from drivers.interfaces import ColourCamera
 from drivers.isolation import IsolatedCamera
 from surfclass.frames import ColourFrame
 
@@ -36,15 +38,8 @@ _FAULTS: dict[Trouble, dict[str, Any]] = {"mute": {"mute": True}, "half": {"shor
 _VM = Path("/opt/vm/tests/vm/firefly_gadget.py")
 
 
-def camera(options: dict[str, Any], environment: dict[str, str]) -> IsolatedCamera[ColourFrame]:
-    return IsolatedCamera(
-        "drivers.colour_iidc:in_process", name="colour", options=options, environment=environment
-    )
-
-
 def bench(
-    options: dict[str, Any],
-    environment: dict[str, str],
+    camera: ColourCamera,
     slack_s: float,
     plug: Callable[[], None],
     unplug: Callable[[], None],
@@ -60,7 +55,7 @@ def bench(
         faults({})
         plug()
 
-    return Bench(SystemClock(), colour=camera(options, environment), fail=fail, mend=mend, slack_s=slack_s)
+    return Bench(SystemClock(), colour=camera, fail=fail, mend=mend, slack_s=slack_s)
 
 
 @cache
@@ -74,7 +69,7 @@ def stand_in() -> Path:
 
 
 @contextmanager
-def on_a_socket(folder: Path, **more: Any) -> Iterator[Bench]:
+def on_a_socket(folder: Path) -> Iterator[Bench]:
     from firefly_socket import FireflySocket
 
     from drivers.sim.firefly import Faults
@@ -86,10 +81,11 @@ def on_a_socket(folder: Path, **more: Any) -> Iterator[Bench]:
         def faults(changed: dict[str, Any]) -> None:
             firefly.camera.faults = Faults(**changed)
 
-        made = bench({**OPTIONS, **more}, environment, 0.4, firefly.plug, firefly.unplug, faults)
-        yield made
-        assert made.colour is not None
-        made.colour.close()
+        camera: IsolatedCamera[ColourFrame] = IsolatedCamera(
+            "drivers.colour_iidc:in_process", name="colour", options=OPTIONS, environment=environment
+        )
+        yield bench(camera, 0.4, firefly.plug, firefly.unplug, faults)
+        camera.close()
 
 
 class Gadget:
@@ -156,11 +152,10 @@ def on_usb(_: Path) -> Iterator[Bench]:
     device.faults({})
     device.unplug()
     device.plug()
-    # Under emulation a frame takes a few 100 ms.
-    made = bench(OPTIONS, {}, 1.5, device.plug, device.unplug, device.faults)
-    yield made
-    assert made.colour is not None
-    made.colour.close()
+    # In this process: under emulation another one takes 10 s to start; guest_iidc.py does it once.
+    camera = in_process(name="colour", clock=SystemClock(), options=OPTIONS, shared={})
+    yield bench(camera, 1.5, device.plug, device.unplug, device.faults)
+    camera.close()
 
 
 def _missing_on_a_socket() -> str:
