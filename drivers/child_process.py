@@ -55,7 +55,7 @@ class ChildProcess:
             with ExitStack() as given:  # what the process has of its own once it runs
                 given.callback(theirs.close)
                 given.callback(os.close, lifeline)
-                memory = FrameMemory.descriptor(f"surfclass {name}"[:200])
+                memory = FrameMemory.descriptor("surfclass frames")
                 given.callback(os.close, memory)
                 self.memory = FrameMemory(memory, writable=False)
                 held.callback(self.memory.close)
@@ -126,6 +126,7 @@ class ChildProcess:
             if answer.get("id") == self._asked:
                 self._asked_since_ns = None
                 return answer
+            self._asked_since_ns = time.monotonic_ns()  # late, but not silent
 
     def silent_s(self) -> float:
         """Returns for how long it has owed answers, s; 0 where it owes none."""

@@ -86,7 +86,8 @@ class IsolatedCamera(Generic[Frame]):
     @property
     def pid(self) -> int | None:
         """The process id of the child while there is one."""
-        return None if self._child is None else self._child.pid
+        child = self._child  # another thread may ask, for a status
+        return None if child is None else child.pid
 
     def open(self) -> None:
         """Starts a process and opens the device in it; ends one that was there before.

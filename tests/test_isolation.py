@@ -387,6 +387,15 @@ class TestHang:
             with pytest.raises(DeviceLostError, match=r"hung in check\(\)"):
                 called_until_it_fails(camera, "check")
 
+    def test_a_driver_whose_checks_take_too_long_is_slow_and_does_not_hang(self, monkeypatch):
+        with isolated({"check": ["wait 0.5"] * 4}) as camera:
+            monkeypatch.setattr(isolation, "_CHECK_S", 0.3)
+            for _ in range(4):
+                with pytest.raises(DeviceTimeoutError):
+                    camera.check()
+                time.sleep(0.4)
+            assert camera.grab(0, 5.0).sequence == 1
+
     def test_an_answer_that_came_too_late_is_not_taken_for_the_next(self):
         def interrupt(number, frame):
             raise InterruptedError
