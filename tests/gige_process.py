@@ -1,4 +1,8 @@
-"""The emulated GigE camera of the tests: a process that may be killed, one on this computer at a time."""
+"""The emulated GigE camera of the tests: a process that may be killed, one for each network address.
+
+GigE Vision has one port, so test runs take turns at 127.0.0.1, and skip these tests where something else has
+it; $GIGE_TEST_ADDRESS names another address of this computer, such as one more of the loopback interface.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +10,26 @@ import atexit
 import ctypes
 import fcntl
 import importlib.util
+import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import IO
 
 import pytest
 
-SERIAL = "SIM01"
-ADDRESS = "127.0.0.1"
+from drivers.sim.gige_library import GVCP_PORT
+
+SERIAL = f"T{os.getpid()}"
+ADDRESS = os.environ.get("GIGE_TEST_ADDRESS", "127.0.0.1")
 _ROOT = Path(__file__).parents[1]
 _PATIENCE_S = 60.0
+_ARGUMENTS = ("--serial", SERIAL, "--address", ADDRESS, "--scale", "0.05")
 
 
 def missing() -> str:
@@ -44,8 +51,8 @@ def missing() -> str:
 
 @cache
 def _lock() -> IO[str]:
-    """GigE Vision has one port: whoever tests it on this computer waits for the others."""
-    path = Path(tempfile.gettempdir()) / "gige-camera-tests.lock"
+    """Whoever tests on this address waits for the others."""
+    path = Path(tempfile.gettempdir()) / f"gige-camera-tests-{ADDRESS}.lock"
     lock = path.open("w")
     until = time.monotonic() + _PATIENCE_S
     while True:
@@ -71,7 +78,7 @@ class GigeProcess:
             return
         _lock()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "drivers.sim.gige_camera", "--serial", SERIAL, "--scale", "0.05"],
+            [sys.executable, "-m", "drivers.sim.gige_camera", *_ARGUMENTS],
             cwd=_ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -83,7 +90,7 @@ class GigeProcess:
             _, why = self._process.communicate(timeout=10)
             self._process = None
             if "does another camera run there" in why:
-                pytest.skip("another GigE camera is emulated on this computer")
+                pytest.skip(f"something else emulates a GigE camera on {ADDRESS}")
             raise AssertionError(why)
 
     def tell(self, line: str) -> str:
@@ -133,9 +140,12 @@ def shared() -> GigeProcess:
     return process
 
 
-@contextmanager
-def port() -> Iterator[None]:
+def take_port() -> None:
     """For a camera that is emulated in the test's own process."""
     _lock()
     shared().stop()
-    yield
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        try:
+            trial.bind((ADDRESS, GVCP_PORT))
+        except OSError:
+            pytest.skip(f"something else emulates a GigE camera on {ADDRESS}")

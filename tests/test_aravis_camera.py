@@ -11,6 +11,7 @@ import gige_process
 import numpy as np
 import pytest
 
+from drivers.aravis_library import Found, Library
 from drivers.clock import SystemClock
 from drivers.colour_aravis import colour, in_process
 from drivers.errors import (
@@ -181,15 +182,30 @@ def test_a_camera_that_another_application_controls_is_not_found(process):
         assert not other.is_open
 
 
-def test_a_camera_is_found_by_its_serial_number_or_when_it_is_the_only_one(process):
-    for serial in (gige_process.SERIAL, None):
-        with make(address=None, serial=serial) as camera:
-            assert camera.about()["serial"] == gige_process.SERIAL
-            assert camera.about()["model"] == "surfclass SimulatedCamera"
-    with pytest.raises(DeviceNotFoundError, match=r"serial number X1 .*found: SimulatedCamera SIM01"):
+def test_a_camera_is_found_by_its_serial_number(process):
+    with make(address=None, serial=gige_process.SERIAL) as camera:
+        assert camera.about()["serial"] == gige_process.SERIAL
+        assert camera.about()["model"] == "surfclass SimulatedCamera"
+    with pytest.raises(DeviceNotFoundError, match=rf"number X1 .*SimulatedCamera {gige_process.SERIAL} at"):
         make(address=None, serial="X1").open()
-    with pytest.raises(DeviceNotFoundError, match="has serial number SIM01, not X1"):
+    with pytest.raises(DeviceNotFoundError, match=f"has serial number {gige_process.SERIAL}, not X1"):
         make(serial="X1").open()
+
+
+@pytest.mark.parametrize("cameras", [0, 1, 2])
+def test_without_a_name_the_only_camera_is_meant(monkeypatch, process, cameras):
+    where = [Found(gige_process.ADDRESS, f"S{n}", "Model", f"10.0.0.{n}") for n in range(cameras)]
+    monkeypatch.setattr(Library, "search", lambda _: where)
+    camera = make(address=None)
+    if cameras == 1:
+        camera.open()
+        camera.close()
+    else:
+        message = (
+            "no camera answers .found: no camera" if cameras == 0 else r"Model S0 at 10\.0\.0\.0, Model S1 at"
+        )
+        with pytest.raises(DeviceNotFoundError, match=message):
+            camera.open()
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,7 @@ class Scene:
 def port():
     if why := gige_process.missing():
         pytest.skip(why)
-    with gige_process.port():
-        yield
+    gige_process.take_port()
 
 
 @pytest.fixture
@@ -54,12 +53,12 @@ def scene(port):
 
 @pytest.fixture
 def emulated(scene):
-    with GigeCamera(scene, "T1") as camera:
+    with GigeCamera(scene, "T1", gige_process.ADDRESS) as camera:
         yield camera
 
 
 def client(**options):
-    options = {"address": "127.0.0.1", "exposure_us": 5000.0, "pixel_format": "BayerRG8", **options}
+    options = {"address": gige_process.ADDRESS, "exposure_us": 5000.0, "pixel_format": "BayerRG8", **options}
     return in_process(name="colour", clock=SystemClock(), options=options, shared={})
 
 
@@ -149,7 +148,9 @@ def test_a_line_triggers_and_nothing_else_does(scene, emulated):
 
 def test_the_strobe_lines_are_those_that_the_client_has_set(scene, port):
     pulses = []
-    with GigeCamera(scene, "T1", strobed=lambda *times: pulses.append(times)) as emulated:
+    with GigeCamera(
+        scene, "T1", gige_process.ADDRESS, strobed=lambda *times: pulses.append(times)
+    ) as emulated:
         with client(strobe_lines=["Line2", "Line3"]) as camera:
             assert emulated.strobe_lines == ("Line2", "Line3")
             grab(camera)
@@ -174,10 +175,10 @@ def test_a_cell_that_fails_leaves_a_mute_camera_and_a_line_in_the_log(scene, emu
 def test_it_starts_once_and_its_port_is_its_own(scene, emulated):
     emulated.start()
     with pytest.raises(InputError, match="does another camera run there"):
-        GigeCamera(scene, "T2").start()
+        GigeCamera(scene, "T2", gige_process.ADDRESS).start()
     emulated.stop()
     emulated.stop()
-    with GigeCamera(scene, "T2"):
+    with GigeCamera(scene, "T2", gige_process.ADDRESS):
         pass
 
 
@@ -188,8 +189,8 @@ def test_a_serial_number_that_has_no_room_is_refused(serial):
 
 
 def test_an_address_of_another_computer_is_refused(port):
-    with pytest.raises(InputError, match=r"192\.0\.2\.1"):
-        GigeCamera(Scene(), "T1", "192.0.2.1").start()
+    with pytest.raises(InputError, match=r"198\.51\.100\.1"):
+        GigeCamera(Scene(), "T1", "198.51.100.1").start()
 
 
 def test_lines_of_text_are_obeyed(emulated):
