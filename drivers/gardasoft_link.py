@@ -43,7 +43,7 @@ class NetworkPort:
 
     Args:
         name: The device's, which errors name.
-        host: Its name or address.
+        host: Its IPv4 address.
         port: Where it listens; 30313 by default of the maker.
         local_port: None: TCP. Otherwise UDP, from and back to this port of ours; 30312 by default of
             the maker.
@@ -79,10 +79,10 @@ class NetworkPort:
                 made.bind(("", self._local_port))
                 made.connect(self._to)
             made.settimeout(self._timeout_s)
-        except (OSError, UnicodeError) as error:  # a host's name can be one that cannot be encoded
+        except OSError as error:
             if made is not None:
                 made.close()
-            taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
+            taken = error.errno == errno.EADDRINUSE
             why = f"another program has UDP port {self._local_port}; end that program" if taken else error
             raise DeviceNotFoundError(self.name, f"{self.address}: {why}") from error
         self._socket = made

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import ipaddress
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, Strict, model_validator
+from pydantic import AfterValidator, Field, Strict, model_validator
 
 from drivers import gardasoft
 from drivers.gardasoft import GardasoftError
@@ -14,12 +15,19 @@ _Port = Annotated[int, Strict(), Field(ge=1, le=65535)]
 _Input = Annotated[int, Strict(), Field(ge=1, le=8)]
 
 
+def _ipv4(text: str) -> str:
+    try:
+        return str(ipaddress.IPv4Address(text))
+    except ValueError as error:
+        raise ValueError("allowed is an IPv4 address such as 192.168.1.21") from error
+
+
 class LightOptions(Table):
     """Where the controller is, what the light stands, and how it is used.
 
     Attributes:
         port_path: The serial port, such as /dev/serial/by-id/usb-…; this or `host`.
-        host: The name or address of a controller on Ethernet.
+        host: The IPv4 address of a controller on Ethernet; no name, since looking one up can take long.
         host_port: Where it listens.
         local_port: UDP from and back to this port of ours (30312 by default of the maker); without it
             TCP.
@@ -41,7 +49,7 @@ class LightOptions(Table):
     """
 
     port_path: str | None = None
-    host: str | None = None
+    host: Annotated[str, AfterValidator(_ipv4)] | None = None
     host_port: _Port = 30313
     local_port: _Port | None = None
     channel: _Input = 1

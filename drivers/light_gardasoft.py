@@ -56,11 +56,19 @@ class GardasoftLight:
 
     What the controller calls fatal (errors 40…47, over-temperature, over-current) stays: every call
     raises DeviceFaultError until the driver is closed and opened again, which clears the controller.
+
+    Args:
+        name: How messages call it.
+        clock: The host's.
+        options: Where it is, and what it may do.
+        transport: Closed; None: the one that the options ask for.
     """
 
-    def __init__(self, name: str, clock: Clock, options: LightOptions) -> None:
+    def __init__(
+        self, name: str, clock: Clock, options: LightOptions, transport: Transport | None = None
+    ) -> None:
         self._name, self._clock, self._options = name, clock, options
-        self._link = GardasoftLink(name, _transport(name, options), options.reply_timeout_s)
+        self._link = GardasoftLink(name, transport or _transport(name, options), options.reply_timeout_s)
         self._lock = threading.RLock()  # the caller's thread and the timer's
         self._channel = GardasoftChannel(self._link, options.channel)
         self._timer = OnTimer(f"{name} off", self._expire)
@@ -115,11 +123,17 @@ class GardasoftLight:
     def close(self) -> None:
         """Puts the light out, waits for its answer (for about four reply timeouts), and disconnects."""
         with self._lock:
-            if self._link.transport.is_open:
-                self._put_out_for_good()
-                self._clock.sleep(self._options.settle_ms / 1e3)  # dark when it returns, not soon after
-            self._link.close()
-            self._is_open = False
+            try:
+                if self._link.transport.is_open:
+                    self._put_out_for_good()
+                    self._clock.sleep(self._options.settle_ms / 1e3)  # dark when it returns, not soon after
+            except BaseException:  # an interrupt
+                self._put_out()
+                raise
+            finally:
+                self._link.close()
+                self._is_open = False
+                self._lit = False
         self._timer.close()
 
     def __enter__(self) -> Self:

@@ -217,9 +217,9 @@ class LedOutputs:
 
     def _clear(self, numbers: list[str]) -> str:
         _count(numbers, 0, 0)
-        event, self._event = self._event, b""
-        if not self._hot:
-            self._trip = None
+        event = self._event
+        if not self._hot:  # else it says so again, and still does not shine
+            self._event, self._trip = b"", None
         return event.decode()
 
     def _save(self, numbers: list[str]) -> str:
