@@ -53,7 +53,7 @@ class IsolatedCamera(Generic[Frame]):
         name: str,
         options: Mapping[str, Any],
         environment: Mapping[str, str] | None = None,
-        open_timeout_s: float = 20.0,
+        open_timeout_s: float = 10.0,
     ) -> None:
         if not re.fullmatch(r"\w+(\.\w+)*:\w+", factory):
             raise ConfigurationError(f"{name}: factory {factory!r}, allowed is module:function")

@@ -10,7 +10,17 @@ import pytest
 from bench import Backend, Bench
 
 # Each names a module beside this file with a list BACKENDS.
-BENCHES = ("bench_sim", "bench_v4l2")
+BENCHES = (
+    "bench_sim",
+    "bench_isolated",
+    "bench_openni2",
+    "bench_aravis",
+    "bench_v4l2",
+    "bench_iidc",
+    "bench_gardasoft",
+    "bench_bcap",
+    "bench_can",
+)
 
 
 def backends() -> list[Backend]:
