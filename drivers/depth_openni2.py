@@ -19,7 +19,7 @@ from drivers.device_clock import DeviceClock
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from drivers.interfaces import Clock
 from drivers.isolation import IsolatedCamera
-from drivers.openni2.api import DeviceProperty, DeviceState, PixelFormat
+from drivers.openni2.api import DeviceProperty, PixelFormat
 from drivers.openni2.errors import OpenNI2Error, driver_error, driver_errors
 from drivers.openni2.opening import ANY, Streams, open_streams
 from drivers.openni2.pairs import Pair, unit_um, whole_millimetres
@@ -130,7 +130,6 @@ class OpenNI2Camera:
         self._streams: Streams | None = None
         self._source: Reader | Playback | None = None
         self._gone: set[str] = set()
-        self._ended = False
 
     @property
     def name(self) -> str:
@@ -153,9 +152,9 @@ class OpenNI2Camera:
         """
         if self.is_open:
             return
-        self._gone, self._ended = set(), False
+        self._gone = set()
         try:
-            self._runtime = Runtime(self._options.plugins, self._on_disconnect, self._on_state)
+            self._runtime = Runtime(self._options.plugins, self._on_disconnect)
             self._source = self._open_source(self._runtime)
         except BaseException as error:
             self.close()
@@ -169,7 +168,7 @@ class OpenNI2Camera:
         source, self._source = self._source, None
         streams, self._streams = self._streams, None
         runtime, self._runtime = self._runtime, None
-        if isinstance(source, Reader):
+        if source is not None:
             source.close()
         try:
             if streams is not None:
@@ -189,7 +188,7 @@ class OpenNI2Camera:
         """
         source = self._opened()
         if isinstance(source, Playback):
-            if self._ended:
+            if source.ended:
                 raise DeviceFaultError(self._name, f"the recording ended after {source.pairs} exposures")
             return
         with driver_errors(self._name):
@@ -219,7 +218,7 @@ class OpenNI2Camera:
             }
         if isinstance(source, Playback):
             facts["clock"] = "the recording's; frames are stamped as if taken when asked for"
-            facts["status"] = f"{source.pairs} of {source.frames} exposures played"
+            facts["status"] = f"{source.pairs} of {source.frames or 'unknown'} exposures played"
         else:
             facts["clock"], facts["status"] = source.describe_clock(), source.describe()
         return {key: value for key, value in facts.items() if value}
@@ -307,12 +306,6 @@ class OpenNI2Camera:
         streams, source = self._streams, self._source
         if streams is not None and streams.device.uri == uri and isinstance(source, Reader):
             source.disconnected()
-
-    def _on_state(self, uri: str, state: int) -> None:
-        if state == DeviceState.EOF:
-            self._ended = True
-            if isinstance(self._source, Playback):
-                self._source.ended()
 
 
 def record_oni(

@@ -39,7 +39,6 @@ NUMBERS = {
     api.Status: ("OniStatus", "ONI_STATUS_"),
     api.Sensor: ("OniSensorType", "ONI_SENSOR_"),
     api.PixelFormat: ("OniPixelFormat", "ONI_PIXEL_FORMAT_"),
-    api.DeviceState: ("OniDeviceState", "ONI_DEVICE_STATE_"),
     api.DeviceProperty: (None, "ONI_DEVICE_PROPERTY_"),
     api.StreamProperty: (None, "ONI_STREAM_PROPERTY_"),
 }

@@ -49,15 +49,6 @@ class PixelFormat(IntEnum):
     GRAY16 = 203
 
 
-class DeviceState(IntEnum):
-    """OniDeviceState."""
-
-    OK = 0
-    ERROR = 1
-    NOT_READY = 2
-    EOF = 3
-
-
 class DeviceProperty(IntEnum):
     """ONI_DEVICE_PROPERTY_…."""
 

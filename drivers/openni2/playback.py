@@ -1,12 +1,13 @@
 """Plays a `.oni` recording back: every exposure, in the file's order, one for each question.
 
 The player is run by hand (speed −1): it decodes one more image whenever one is waited for. It is never
-asked to seek, which hangs.
+asked to seek, which hangs, and never let come to the file's end: there its thread spins over its list of
+streams, and crashes when one is closed. It repeats instead, and what comes after the last image is left.
 """
 
 from __future__ import annotations
 
-import threading
+import time
 from ctypes import c_float, c_int
 
 from drivers.openni2.api import DeviceProperty, Sensor, StreamProperty
@@ -15,26 +16,35 @@ from drivers.openni2.opening import Streams
 from drivers.openni2.pairs import Pair, Pairing
 
 _BY_HAND = -1.0
+_UNKNOWN = 0xFFFFFFFF  # of frames, in a recording that was cut off
+_SETTLE_S = 0.1
 
 
 class Playback:
     """A recording that is open, from its beginning.
 
     Args:
-        streams: The open recording's; still to be closed by the caller.
+        streams: The open recording's; still to be closed by the caller, after close() here.
         pair_tolerance_us: Stamps of one exposure's images differ by no more.
+
+    Attributes:
+        frames: How many exposures the file says that it has, None where it does not.
+        pairs: How many were played.
     """
 
     def __init__(self, streams: Streams, pair_tolerance_us: int) -> None:
         self._streams = streams
         self._pairing = Pairing(streams.infrared is not None, pair_tolerance_us)
-        self._left = {
-            stream.sensor: stream.integer(StreamProperty.NUMBER_OF_FRAMES) for stream in streams.all
-        }
+        number = StreamProperty.NUMBER_OF_FRAMES
+        counts = [(stream.integer(number) or 0) % 2**32 for stream in streams.all]
+        self.frames = None if _UNKNOWN in counts else min(counts)
         self._at: dict[Sensor, int] = {}
-        self._ended = threading.Event()
-        self.frames = min(left or 0 for left in self._left.values())
         self.pairs = 0
+
+    @property
+    def ended(self) -> bool:
+        """Whether all that the file says it has was played."""
+        return self.frames is not None and self.pairs >= self.frames
 
     def start(self) -> None:
         """Sets the player up and starts the streams.
@@ -43,14 +53,14 @@ class Playback:
             OpenNI2Error: If it cannot be.
         """
         device = self._streams.device
-        device.write(DeviceProperty.PLAYBACK_REPEAT_ENABLED, c_int(0))
+        device.write(DeviceProperty.PLAYBACK_REPEAT_ENABLED, c_int(1))
         device.write(DeviceProperty.PLAYBACK_SPEED, c_float(_BY_HAND))
         for stream in self._streams.all:
             stream.start()
 
-    def ended(self) -> None:
-        """Takes note that the player reached the end; from any thread."""
-        self._ended.set()
+    def close(self) -> None:
+        """Lets the player's thread come to where it waits; the only place where streams may be taken away."""
+        time.sleep(_SETTLE_S)
 
     def next(self, timeout_s: float) -> Pair | None:
         """Returns the next exposure, None if the player gave no image within the timeout.
@@ -60,26 +70,24 @@ class Playback:
             OpenNI2Error: If the runtime fails.
         """
         while True:
+            if self.ended:
+                raise BrokenError(f"the recording ended after {self.pairs} exposures")
             # An image not waited for would be overwritten by the next: exactly one is asked for here.
             self._streams.device.forget_wakeup()
-            if all(not left for left in self._left.values()):
-                raise BrokenError(f"the recording ended after {self.pairs} exposures")
             stream = self._streams.device.wait(self._streams.all, timeout_s)
             if stream is None:
-                if self._ended.is_set():
-                    raise BrokenError(f"the recording ended after {self.pairs} exposures")
                 return None
             image = stream.fetch()
-            self._count(stream.sensor, image.index)
+            self._must_follow(stream.sensor, image.index)
             pair = self._pairing.add(stream.sensor, image)
             if pair is not None:
                 self.pairs += 1
                 return pair
 
-    def _count(self, sensor: Sensor, index: int) -> None:
+    def _must_follow(self, sensor: Sensor, index: int) -> None:
         before = self._at.get(sensor)
-        if before is not None and index != before + 1:
+        if before is not None and index <= before:  # it plays from the beginning again
+            raise BrokenError(f"the recording ended after {self.pairs} exposures, with no sign of its end")
+        if before is not None and index > before + 1:
             raise BrokenError(f"the recording's {sensor.name} image {before + 1} is missing or damaged")
         self._at[sensor] = index
-        left = self._left[sensor]
-        self._left[sensor] = None if left is None else max(0, left - 1)

@@ -113,17 +113,18 @@ def _next(streams: Streams, pairing: Pairing, deadline_ns: int) -> Pair:
 
 def _read_back(runtime: Runtime, path: Path, tolerance_us: int) -> list[_Sums]:
     streams = open_streams(runtime, str(path), None, None, with_ir=True)
+    playback = Playback(streams, tolerance_us)
+    written = []
     try:
-        playback = Playback(streams, tolerance_us)
         playback.start()
-        written = []
-        for _ in range(playback.frames):
+        while not playback.ended:
             pair = playback.next(_READ_S)
             if pair is None:
                 raise OpenNI2Error(str(path), Status.TIME_OUT, "the player gives no image")
             written.append(_sums(pair))
         return written
     finally:
+        playback.close()
         streams.device.close()
 
 

@@ -42,7 +42,6 @@ class Runtime:
     Args:
         drivers: Names out of `plugins.OWN` and `plugins.SYSTEM`.
         on_disconnect: Called with the URI of each device that goes, from a thread of the runtime.
-        on_state: Called with the URI and the `api.DeviceState`, likewise.
 
     Raises:
         PluginMissingError: If the library or a plug-in is missing or cannot be loaded.
@@ -50,12 +49,7 @@ class Runtime:
         HangingError: If it hangs in this process.
     """
 
-    def __init__(
-        self,
-        drivers: Iterable[str],
-        on_disconnect: Callable[[str], None] | None = None,
-        on_state: Callable[[str, int], None] | None = None,
-    ) -> None:
+    def __init__(self, drivers: Iterable[str], on_disconnect: Callable[[str], None] | None = None) -> None:
         if _loaded is not None and _loaded[0].hangs:
             raise HangingError("OpenNI2", api.Status.ERROR, "the library hangs in this process")
         if not _in_use.acquire(blocking=False):
@@ -63,7 +57,7 @@ class Runtime:
         self._callback: c_void_p | None = None
         try:
             self.api = _started({name: plugins.find(name) for name in drivers})
-            self._listen(on_disconnect, on_state)
+            self._listen(on_disconnect)
         except BaseException:
             _in_use.release()
             raise
@@ -101,22 +95,16 @@ class Runtime:
         finally:
             self.api.call("ReleaseDeviceList", first)
 
-    def _listen(
-        self, on_disconnect: Callable[[str], None] | None, on_state: Callable[[str, int], None] | None
-    ) -> None:
+    def _listen(self, on_disconnect: Callable[[str], None] | None) -> None:
         def disconnected(info: Any, _: Any) -> None:
             if on_disconnect is not None:
                 on_disconnect(_listed(info[0]).uri)
-
-        def state_changed(info: Any, state: int, _: Any) -> None:
-            if on_state is not None:
-                on_state(_listed(info[0]).uri, state)
 
         # Kept: the runtime calls them for as long as they are registered.
         self._callbacks = api.DeviceCallbacks(
             api.DeviceCallback(lambda info, _: None),
             api.DeviceCallback(disconnected),
-            api.StateCallback(state_changed),
+            api.StateCallback(lambda info, state, _: None),
         )
         handle = c_void_p()
         try:
