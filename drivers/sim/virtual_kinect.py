@@ -231,7 +231,8 @@ class VirtualKinect:
             depth, ir = self._cell.depth(exposed_ns, index)
             due_ns = exposed_ns + self._latency_ns
             late_ns = time.monotonic_ns() - due_ns
-            self._ending.wait(max(0, -late_ns) / 1e9)
+            if self._ending.wait(max(0, -late_ns) / 1e9):
+                return
             with self._lock:
                 if late_ns > 0 and not self._late:
                     _log.warning("virtual Kinect: a frame took %.0f ms more than latency_s", late_ns / 1e6)
