@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from math import degrees
 from types import TracebackType
 from typing import Literal, Protocol, Self
@@ -61,7 +61,6 @@ class CanBridge:
         late_s: How late the fault "late" is.
 
     Attributes:
-        faults: What fails; may be changed at any time.
         cycles: How many have been sent.
         undelivered: Frames that the bus did not take.
     """
@@ -74,12 +73,23 @@ class CanBridge:
         period_s: float = 0.01,
         late_s: float = 0.05,
     ) -> None:
-        self.faults: set[BridgeFault] = set()
         self.cycles = self.undelivered = 0
         self._cell, self._send = cell, send
         self._period_s, self._late_s = period_s, late_s
+        self._faults: frozenset[BridgeFault] = frozenset()
+        self._cycling = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+
+    @property
+    def faults(self) -> frozenset[BridgeFault]:
+        """What fails; may be set at any time, and holds for all that is sent after that."""
+        return self._faults
+
+    @faults.setter
+    def faults(self, faults: Collection[BridgeFault]) -> None:
+        with self._cycling:
+            self._faults = frozenset(faults)
 
     def start(self) -> None:
         """Begins to send."""
@@ -108,12 +118,12 @@ class CanBridge:
         while not self._stop.wait(max(0.0, due_s - time.monotonic())):
             due_s = max(due_s + self._period_s, time.monotonic())
             try:
-                self._cycle()
+                with self._cycling:
+                    self._cycle(self._faults)
             except DriverError:  # unplugged: a PLC goes on all the same
                 self.undelivered += 1
 
-    def _cycle(self) -> None:
-        faults = frozenset(self.faults)
+    def _cycle(self, faults: frozenset[BridgeFault]) -> None:
         if "mute" in faults:
             return
         if "frozen" not in faults:
@@ -129,7 +139,7 @@ class CanBridge:
                 self._send(can_id, data)
 
 
-def joint_frames(q: Float64, counter: int, faults: frozenset[str] = frozenset()) -> list[tuple[int, bytes]]:
+def joint_frames(q: Float64, counter: int, faults: Collection[str] = ()) -> list[tuple[int, bytes]]:
     """Returns the three frames, id and data, of joint angles q (6,) rad.
 
     Args:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -45,9 +46,6 @@ class CiaNodes:
         sync_period_s: How often they send SYNC themselves; None: another does it.
         operational: Whether they start sending by themselves, or wait to be set operational.
         late_s: How late the fault "late" is.
-
-    Attributes:
-        faults: What fails; may be changed at any time.
     """
 
     def __init__(
@@ -61,14 +59,14 @@ class CiaNodes:
         late_s: float = 0.05,
     ) -> None:
         canopen = importlib.import_module("canopen")
-        self.faults: set[NodeFault] = set()
         self._cell, self._send = cell, send
         self._drive = profile == 402
         self._object = 0x6064 if self._drive else 0x6004
         self._sync_period_s, self._late_s = sync_period_s, late_s
         self._network: Any = canopen.Network(OnBus(self._answer))
         self._nodes: list[LocalNode] = []
-        self._lock = threading.Lock()
+        self._faults: frozenset[NodeFault] = frozenset()
+        self._answering = threading.RLock()  # several threads may make them send
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         for node_id in NODE_IDS:
@@ -79,14 +77,22 @@ class CiaNodes:
         if operational:
             self.receive_command(bytes([1, 0]))
 
+    @property
+    def faults(self) -> frozenset[NodeFault]:
+        """What fails; may be set at any time, and holds for all that is sent after that."""
+        return self._faults
+
+    @faults.setter
+    def faults(self, faults: Collection[NodeFault]) -> None:
+        with self._answering:
+            self._faults = frozenset(faults)
+
     def receive(self, frame: CanFrame) -> None:
         """Takes a frame of the bus."""
-        if "mute" in self.faults or frame.extended:
+        if frame.extended:
             return
-        if frame.can_id == SYNC_ID:
-            self._answer_sync(time.monotonic_ns())
-        elif len(frame.data) == 8 or frame.can_id == 0:
-            self._network.notify(frame.can_id, bytearray(frame.data), frame.span.end_ns / 1e9)
+        with self._answering:
+            self._take(frame)
 
     def receive_command(self, data: bytes) -> None:
         """Takes an NMT command: its code, and a node or 0 for all."""
@@ -124,33 +130,39 @@ class CiaNodes:
     ) -> None:
         self.stop()
 
+    def _take(self, frame: CanFrame) -> None:
+        if "mute" in self._faults:
+            return
+        if frame.can_id == SYNC_ID:
+            self._answer_sync(time.monotonic_ns())
+        elif len(frame.data) == 8 or frame.can_id == 0:
+            self._network.notify(frame.can_id, bytearray(frame.data), frame.span.end_ns / 1e9)
+
     def _run(self, period_s: float) -> None:
         while not self._stop.wait(period_s):
-            if "mute" not in self.faults:
-                t_ns = time.monotonic_ns()
-                self._answer(SYNC_ID, b"", False)
-                self._answer_sync(t_ns)
+            with self._answering:
+                if "mute" not in self._faults:
+                    t_ns = time.monotonic_ns()
+                    self._answer(SYNC_ID, b"", False)
+                    self._answer_sync(t_ns)
 
     def _answer_sync(self, t_ns: int) -> None:
         for node in self._nodes:
-            if node.nmt.state != "OPERATIONAL" or (node.id == 6 and "missing" in self.faults):
+            if node.nmt.state != "OPERATIONAL" or (node.id == 6 and "missing" in self._faults):
                 continue
-            if node.id == 6 and "late" in self.faults:
+            if node.id == 6 and "late" in self._faults:
                 self._stop.wait(self._late_s)
             data = self._counts(node.id or 0, t_ns).to_bytes(4, "little")
             data = bytes([0x37, 0x06]) + data if self._drive else data
-            self._answer(_TPDO_ID + (node.id or 0), data[:3] if "short" in self.faults else data, False)
+            self._answer(_TPDO_ID + (node.id or 0), data[:3] if "short" in self._faults else data, False)
 
     def _answer(self, can_id: int, data: bytes, extended: bool) -> None:
-        with self._lock:
-            try:
-                self._send(can_id, data, extended)
-            except DriverError:  # unplugged: a node goes on all the same
-                return
+        with self._answering, contextlib.suppress(DriverError):  # unplugged: a node goes on all the same
+            self._send(can_id, data, extended)
 
     def _counts(self, node_id: int, t_ns: int) -> int:
         angle = float(self._cell.joints(t_ns)[node_id - 1])
-        if node_id == 2 and "impossible" in self.faults:
+        if node_id == 2 and "impossible" in self._faults:
             angle = math.radians(400)
         return (round(angle / math.tau * COUNTS_PER_TURN) + ZERO_COUNTS) % (1 << 32)
 
