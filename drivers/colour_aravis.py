@@ -34,7 +34,7 @@ from surfclass.schema import validate
 T = TypeVar("T")
 
 _OPEN_S = 12.0  # a search takes 1 s, a description of 1 MB over GigE several
-_WARM_UP_FRAMES, _WARM_UP_S = 3, 1.0
+_WARM_UP_FRAMES, _WARM_UP_S = 3, 3.0
 _COMMAND_S = 0.3  # a camera that is there takes a command within milliseconds
 _SLICE_S = 0.05  # how long a loss goes unnoticed while a frame is waited for
 _log = logging.getLogger("surfclass.aravis")
@@ -214,6 +214,7 @@ class AravisCamera:
                     raise DeviceTimeoutError(self._name, "no frame came in time")
             elif not buffer.complete:
                 session.incomplete += 1
+                session.count.number(buffer.frame_id)
                 _log.debug("%s: frame %d: %s", self._name, buffer.frame_id, buffer.status)
                 if trigger is not None:
                     return None

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sim.gige_image import FORMATS, Processing, encoded
-from drivers.sim.gige_library import Exposure, FakeCamera
+from drivers.sim.gige_library import FakeCamera
 from surfclass.errors import InputError
 
 FEATURES = Path(__file__).with_suffix(".xml")
@@ -28,18 +28,19 @@ LINES = ("Line0", "Line1", "Line2", "Line3")
 _log = logging.getLogger("surfclass.sim.gige")
 
 # Registers of GvFakeCamera (arvfakecamera.h), then those that only gige_camera.xml knows.
-_WIDTH, _HEIGHT, _X, _Y, _FORMAT = 0x100, 0x104, 0x130, 0x134, 0x128
-_SENSOR_HEIGHT, _SENSOR_WIDTH, _GAIN, _EXPOSURE = 0x118, 0x11C, 0x110, 0x120
-_VENDOR, _MODEL, _ACQUISITION, _TRIGGER_SOURCE, _TRIGGER_NOW = 0x48, 0x68, 0x124, 0x304, 0x30C
+_WIDTH, _HEIGHT, _X, _Y, _FORMAT, _PERIOD_US = 0x100, 0x104, 0x130, 0x134, 0x128, 0x138
+_SENSOR_HEIGHT, _SENSOR_WIDTH, _GAIN, _EXPOSURE, _ACQUISITION = 0x118, 0x11C, 0x110, 0x120, 0x124
+_VENDOR, _MODEL, _SEND_MODE, _SEND_SOURCE, _SEND = 0x48, 0x68, 0x300, 0x304, 0x30C
 _EXPOSURE_AUTO, _GAIN_AUTO, _WHITE_AUTO, _BALANCE_RED, _BALANCE_BLUE = 0x8000, 0x8004, 0x8008, 0x8010, 0x8014
-_GAMMA_ENABLE, _GAMMA, _SHARPENING, _SATURATION, _REVERSE_X, _REVERSE_Y = (
-    *(0x8020, 0x8024, 0x8028, 0x802C),
-    *(0x8034, 0x8038),
-)
-_CLIENT_TRIGGER_SOURCE, _LINE_MODE, _LINE_SOURCE, _FIRMWARE = 0x8040, 0x8060, 0x8070, 0x80A0
+_GAMMA_ENABLE, _GAMMA, _SHARPENING, _SATURATION = 0x8020, 0x8024, 0x8028, 0x802C
+_REVERSE_X, _REVERSE_Y, _TRIGGER_SOURCE, _TRIGGER_MODE, _TRIGGER = 0x8034, 0x8038, 0x8040, 0x8048, 0x804C
+_LINE_MODE, _LINE_SOURCE, _FIRMWARE = 0x8060, 0x8070, 0x80A0
+
 _SOFTWARE, _OUTPUT, _EXPOSURE_ACTIVE, _CONTINUOUS = 1, 1, 1, 2
 _BAYER_RG8 = 0x01080009
 _ON_FOR_NS = 3_600_000_000_000  # at start: its clock can be set back
+_POLL_S = 0.004  # how often a trigger is looked for
+_END_S = 60.0  # an exposure of 30 s, and its rendering
 
 
 class ColourCell(Protocol):
@@ -59,10 +60,9 @@ class ColourCell(Protocol):
 class GigeCamera:
     """The emulated camera. Like a real one after power-on, it starts with every automatic function on.
 
-    An exposure begins when a trigger is found, within 4 ms (within 0.1 s for the first of an
-    acquisition), and lasts as long as the client has set. While it lasts and is rendered the camera
-    answers no command, which a real one would. RGB8 comes through the cell's own response and no
-    other processing.
+    An exposure begins about 4 ms after its trigger, and lasts as long as the client has set; triggers
+    during it are lost. Rendering takes the place of read-out. RGB8 comes through the cell's own response
+    and no other processing.
 
     Args:
         cell: Whose light it sees.
@@ -83,7 +83,10 @@ class GigeCamera:
             raise InputError(f"serial number {serial!r}, allowed are 1 to 15 characters")
         self._cell, self._serial, self._address, self._strobed = cell, serial, address, strobed
         self._camera: FakeCamera | None = None
+        self._thread: threading.Thread | None = None
         self._ending = threading.Event()
+        self._edge = threading.Event()  # on the line that triggers
+        self._frame: tuple[int, NDArray[np.uint8]] | None = None  # device time and bytes, to be sent
         self._on_ns = 0
         self._frozen_at_ns: int | None = None
         self.frames = 0
@@ -98,14 +101,17 @@ class GigeCamera:
         if self._camera is None:
             self._ending.clear()
             self._frozen_at_ns, self._on_ns = None, time.monotonic_ns() - _ON_FOR_NS
-            self._camera = FakeCamera(self._address, self._serial, FEATURES, self._expose)
+            self._camera = FakeCamera(self._address, self._serial, FEATURES, self._sent)
             self.power_cycle()
+            self._thread = threading.Thread(target=self._run, args=(self._camera,), daemon=True)
+            self._thread.start()
 
     def stop(self) -> None:
         """Makes it disappear, after the exposure under way; may be called twice."""
-        camera, self._camera = self._camera, None
-        if camera is not None:
+        camera, thread, self._camera, self._thread = self._camera, self._thread, None, None
+        if camera is not None and thread is not None:
             self._ending.set()
+            thread.join(_END_S)
             camera.close()
 
     def __enter__(self) -> Self:
@@ -120,19 +126,14 @@ class GigeCamera:
     @property
     def strobe_lines(self) -> tuple[str, ...]:
         """The lines that the client has made give a pulse while a frame is exposed."""
-        read = self._running().read
-        return tuple(
-            line
-            for n, line in enumerate(LINES)
-            if read(_LINE_MODE + 4 * n) == _OUTPUT and read(_LINE_SOURCE + 4 * n) == _EXPOSURE_ACTIVE
-        )
+        return _strobe_lines(self._running())
 
     def pulse(self, line: str = "Line0") -> None:
         """An edge on an input line: exposes a frame, if the client has made it the trigger."""
         if line not in LINES:
             raise InputError(f"line {line!r}, allowed: {', '.join(LINES)}")
-        if self._running().read(_CLIENT_TRIGGER_SOURCE) == LINES.index(line):
-            self._running().write(_TRIGGER_NOW, 1)
+        if self._running().read(_TRIGGER_SOURCE) == LINES.index(line):
+            self._edge.set()
 
     def lose_packets(self, share: float) -> None:
         """From now on this share, 0…1, of all image packets is not sent; at 1 the camera is mute."""
@@ -164,7 +165,8 @@ class GigeCamera:
             _SENSOR_HEIGHT: height,
             _WIDTH: width,
             _HEIGHT: height,
-            **dict.fromkeys((_X, _Y, _GAIN, _REVERSE_X, _REVERSE_Y, _CLIENT_TRIGGER_SOURCE), 0),
+            **dict.fromkeys((_X, _Y, _GAIN, _REVERSE_X, _REVERSE_Y), 0),
+            **dict.fromkeys((_TRIGGER, _TRIGGER_MODE, _TRIGGER_SOURCE), 0),
             **{start + 4 * n: 0 for start in (_LINE_MODE, _LINE_SOURCE) for n in range(len(LINES))},
             **dict.fromkeys((_EXPOSURE_AUTO, _GAIN_AUTO, _WHITE_AUTO), _CONTINUOUS),
             **dict.fromkeys((_GAMMA_ENABLE, _SHARPENING, _SATURATION), 1),
@@ -173,8 +175,10 @@ class GigeCamera:
             _BALANCE_BLUE: 1700,
             _EXPOSURE: 5000,
             _FORMAT: _BAYER_RG8,
-            # Aravis's emulator heeds triggers under this source only; what the client chose is apart.
-            _TRIGGER_SOURCE: _SOFTWARE,
+            _PERIOD_US: 40_000,
+            # Aravis's emulator sends a frame at each trigger of its own; the client's trigger is ours.
+            _SEND_MODE: 1,
+            _SEND_SOURCE: _SOFTWARE,
         }
         for register, value in values.items():
             self._running().write(register, value)
@@ -186,35 +190,59 @@ class GigeCamera:
             raise InputError(f"camera {self._serial} is not started")
         return self._camera
 
-    def _expose(self, exposure: Exposure) -> tuple[int, NDArray[np.uint8]] | None:
-        begin_ns, camera = time.monotonic_ns(), self._camera
-        if camera is None or self._ending.is_set():
-            return None
-        ticks = (self._frozen_at_ns or begin_ns) - self._on_ns
-        try:
-            return ticks, self._exposed(camera, exposure, begin_ns)
-        except Exception:  # noqa: BLE001 - the caller is C, which could do nothing with it
-            _log.exception("an exposure failed: no more frames are sent")
-            camera.lose_packets(1.0)
-            return None
+    def _run(self, camera: FakeCamera) -> None:
+        """Exposes when it is time to, so that Aravis's own thread goes on answering commands."""
+        next_ns = 0
+        while not self._ending.wait(_POLL_S):
+            triggered = self._edge.is_set() or camera.read(_TRIGGER) == 1
+            if triggered:  # and not otherwise: one may just be coming
+                self._edge.clear()
+                camera.write(_TRIGGER, 0)
+            if not camera.read(_ACQUISITION):
+                continue
+            now_ns = time.monotonic_ns()
+            if triggered if camera.read(_TRIGGER_MODE) else now_ns >= next_ns:
+                next_ns = now_ns + 1000 * camera.read(_PERIOD_US)
+                try:
+                    self._expose(camera, now_ns)
+                except Exception:  # noqa: BLE001 - whatever a cell may raise; this thread has no caller
+                    _log.exception("an exposure failed: no more frames are sent")
+                    return
 
-    def _exposed(self, camera: FakeCamera, exposure: Exposure, begin_ns: int) -> NDArray[np.uint8]:
-        end_ns, gain_db = begin_ns + 1000 * exposure.exposure_us, exposure.gain / 100
-        if self._strobed is not None and self.strobe_lines:
+    def _expose(self, camera: FakeCamera, begin_ns: int) -> None:
+        ticks = (self._frozen_at_ns or begin_ns) - self._on_ns
+        end_ns, gain_db = begin_ns + 1000 * camera.read(_EXPOSURE), camera.read(_GAIN) / 100
+        if self._strobed is not None and _strobe_lines(camera):
             self._strobed(begin_ns, end_ns)
         self.frames += 1
-        pixel_format, processing = FORMATS[exposure.code], _processing(camera, exposure.region)
+        pixel_format, processing = FORMATS[camera.read(_FORMAT)], _processing(camera)
         if pixel_format.name == "RGB8":
             rgb = self._cell.rgb(begin_ns, end_ns, gain_db, self.frames)
-            return np.ascontiguousarray(processing.cropped(rgb), np.uint8).ravel()
-        linear = self._cell.raw(begin_ns, end_ns, gain_db, self.frames)
-        return encoded(processing.processed(linear), pixel_format)
+            content = np.ascontiguousarray(processing.cropped(rgb), np.uint8).ravel()
+        else:
+            linear = self._cell.raw(begin_ns, end_ns, gain_db, self.frames)
+            content = encoded(processing.processed(linear), pixel_format)
+        if camera.read(_ACQUISITION):
+            self._frame = ticks, content
+            camera.write(_SEND, 1)
+
+    def _sent(self) -> tuple[int, NDArray[np.uint8]] | None:
+        return self._frame
 
 
-def _processing(camera: FakeCamera, region: tuple[int, int, int, int]) -> Processing:
+def _strobe_lines(camera: FakeCamera) -> tuple[str, ...]:
+    read = camera.read
+    return tuple(
+        line
+        for n, line in enumerate(LINES)
+        if read(_LINE_MODE + 4 * n) == _OUTPUT and read(_LINE_SOURCE + 4 * n) == _EXPOSURE_ACTIVE
+    )
+
+
+def _processing(camera: FakeCamera) -> Processing:
     read = camera.read
     return Processing(
-        region,
+        (read(_X), read(_Y), read(_WIDTH), read(_HEIGHT)),
         (bool(read(_REVERSE_X)), bool(read(_REVERSE_Y))),
         bool(read(_EXPOSURE_AUTO) or read(_GAIN_AUTO)),
         bool(read(_WHITE_AUTO)),
@@ -268,6 +296,7 @@ def main() -> None:
     given = parser.parse_args()
     logging.basicConfig(stream=sys.stderr)
     cell = host_cell(given.scene, given.seed, scale=given.scale)
+    cell.bake()
     with GigeCamera(cell, given.serial, given.address) as camera:
         print("ready", flush=True)
         for line in sys.stdin:

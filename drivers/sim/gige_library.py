@@ -21,7 +21,6 @@ from ctypes import (
     c_uint64,
     c_void_p,
 )
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ GVCP_PORT = 3956
 
 _POLLS_HZ = 250.0  # how often a software trigger is looked for
 _FILL = CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
-_REGION = ("x", "y", "width", "height")
+_SIDES = ("width", "height")
 _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_gv_fake_camera_new_full": (c_void_p, (c_char_p, c_char_p, c_char_p)),
     "arv_gv_fake_camera_is_running": (c_int, (c_void_p,)),
@@ -47,26 +46,10 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_fake_camera_write_register": (c_int, (c_void_p, c_uint32, c_uint32)),
     "arv_buffer_get_data": (c_void_p, (c_void_p, POINTER(c_size_t))),
     "arv_buffer_set_timestamp": (None, (c_void_p, c_uint64)),
-    **{f"arv_buffer_get_part_{what}": (c_int, (c_void_p, c_uint32)) for what in _REGION},
+    **{f"arv_buffer_get_part_{what}": (c_int, (c_void_p, c_uint32)) for what in _SIDES},
     "g_object_unref": (None, (c_void_p,)),
     "g_object_set": (None, (c_void_p, c_char_p, c_double, c_void_p)),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Exposure:
-    """A frame to be filled.
-
-    Attributes:
-        region: x, y, width, height on the sensor.
-        code: Of the pixel format (PFNC).
-        exposure_us: As the client has set it; `gain` likewise, in the unit of its register.
-    """
-
-    region: tuple[int, int, int, int]
-    code: int
-    exposure_us: int
-    gain: int
 
 
 class FakeCamera:
@@ -76,8 +59,8 @@ class FakeCamera:
         address: Of a network interface of this host.
         serial: The camera's serial number, at most 15 characters.
         features: The GenICam description.
-        expose: Called as `expose(exposure)` in the emulator's thread when a frame begins; returns its
-            device time, ns, and its bytes. Must not raise. Until it returns no command is answered.
+        frame: Called in the emulator's thread when a frame is to be sent; returns its device time, ns,
+            and its bytes. Must not raise, nor take long: until it returns no command is answered.
 
     Raises:
         DriverUnavailableError: If Aravis is not installed.
@@ -89,11 +72,11 @@ class FakeCamera:
         address: str,
         serial: str,
         features: Path,
-        expose: Callable[[Exposure], tuple[int, NDArray[np.uint8]] | None],
+        frame: Callable[[], tuple[int, NDArray[np.uint8]] | None],
     ) -> None:
         self._library = _loaded()
         _must_be_free(address)
-        self._expose = expose
+        self._frame = frame
         self._filler = _FILL(self._fill)  # C keeps no reference to it
         self._camera: int | None = self._library.arv_gv_fake_camera_new_full(
             address.encode(), serial.encode(), str(features).encode()
@@ -132,14 +115,13 @@ class FakeCamera:
         self._library.g_object_set(self._camera, b"gvsp-lost-ratio", share, None)
 
     def _fill(self, buffer: int, _: int, exposure_us: int, gain: int, code: int) -> None:
-        region = [getattr(self._library, f"arv_buffer_get_part_{what}")(buffer, 0) for what in _REGION]
-        x, y, width, height = region
-        exposed = self._expose(Exposure((x, y, width, height), code, exposure_us, gain))
-        if exposed is None:
+        found = self._frame()
+        if found is None:
             return
-        ticks_ns, content = exposed
+        ticks_ns, content = found
         self._library.arv_buffer_set_timestamp(buffer, ticks_ns)
         # The buffer's own idea of its size is 0 until it is filled; it was allocated for its format.
+        width, height = (getattr(self._library, f"arv_buffer_get_part_{side}")(buffer, 0) for side in _SIDES)
         size = width * height * (code >> 16 & 0xFF) // 8
         data = self._library.arv_buffer_get_data(buffer, byref(c_size_t()))
         target = np.ctypeslib.as_array((c_uint8 * size).from_address(data))
