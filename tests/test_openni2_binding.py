@@ -127,6 +127,58 @@ def test_a_runtime_leaves_no_folder_behind_and_can_be_started_again_with_other_p
     assert set(Path(tempfile.gettempdir()).glob("surfclass-openni2-*")) <= before
 
 
+def test_a_runtime_that_does_not_start_is_no_hindrance_to_the_next(tmp_path, monkeypatch):
+    (tmp_path / "text").write_text("no library")
+    monkeypatch.setattr(plugins, "find", lambda name: tmp_path / "text")
+    for _ in range(2):
+        with pytest.raises(OpenNI2Error, match="does not start"):
+            Runtime(["OniFile"])
+    monkeypatch.undo()
+    with VirtualKinect(Counting(), tmp_path / "kinect") as kinect:
+        runtime = Runtime(["virtual"])
+        Device(runtime, kinect.uri).close()
+        runtime.close()
+
+
+def test_it_runs_where_no_memory_may_be_written_and_run(tmp_path):
+    """As in a systemd unit with MemoryDenyWriteExecute: callbacks need code of their own."""
+    script = """
+import ctypes, mmap, sys, time
+if ctypes.CDLL(None).prctl(65, 1, 0, 0, 0) != 0:  # PR_SET_MDWE, PR_MDWE_REFUSE_EXEC_GAIN
+    sys.exit(77)
+try:
+    mmap.mmap(-1, 4096, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+except PermissionError:
+    pass
+else:
+    sys.exit(77)
+from drivers import depth_openni2
+from drivers.clock import SystemClock
+from drivers.errors import DeviceLostError
+camera = depth_openni2.in_process(name="d", clock=SystemClock(), options={"device": sys.argv[1]}, shared={})
+with camera:
+    camera.grab(time.monotonic_ns(), 5.0)
+    print("open", flush=True)
+    sys.stdin.readline()
+    until = time.monotonic() + 5
+    try:
+        while time.monotonic() < until:
+            camera.check()
+            time.sleep(0.02)
+    except DeviceLostError:
+        print("lost")
+"""
+    with VirtualKinect(Counting(), tmp_path / "kinect") as kinect:
+        command = [sys.executable, "-c", script, kinect.uri]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+            first = process.stdout.readline()
+            if not first and process.wait(30) == 77:
+                pytest.skip("this kernel cannot deny memory that is written and run")
+            assert first == "open\n"
+            kinect.unplug()
+            assert process.communicate("\n", timeout=30)[0] == "lost\n"
+
+
 def test_there_is_one_runtime_at_a_time():
     first = Runtime(["OniFile"])
     with pytest.raises(OpenNI2Error, match="another camera"):

@@ -135,12 +135,22 @@ def _started(drivers: dict[str, Path]) -> Api:
             _link(folder, drivers)
             if _loaded is None:
                 _loaded = _load(folder / api.LIBRARY), folder
-            _loaded[0].must("OpenNI2 does not start", "Initialize", api.API_VERSION)
+            _initialize(_loaded[0])
         finally:
             shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
         raise OpenNI2Error("a private folder for OpenNI2", api.Status.ERROR, str(error)) from None
     return _loaded[0]
+
+
+def _initialize(library: Api) -> None:
+    try:
+        library.must("OpenNI2 does not start", "Initialize", api.API_VERSION)
+    except OpenNI2Error:
+        library.call(
+            "Shutdown"
+        )  # it counts starts, also those that fail, and takes the next for a repeated one
+        raise
 
 
 def _must_load(own: dict[str, Path]) -> None:
