@@ -20,7 +20,7 @@ from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundErro
 from drivers.interfaces import Clock
 from drivers.isolation import IsolatedCamera
 from drivers.openni2.api import DeviceProperty, PixelFormat
-from drivers.openni2.errors import OpenNI2Error, driver_error, driver_errors
+from drivers.openni2.errors import OpenNI2Error, driver_errors
 from drivers.openni2.opening import ANY, Streams, open_streams
 from drivers.openni2.pairs import Pair, unit_um, whole_millimetres
 from drivers.openni2.playback import Playback
@@ -153,12 +153,13 @@ class OpenNI2Camera:
         if self.is_open:
             return
         self._gone = set()
-        try:
-            self._runtime = Runtime(self._options.plugins, self._on_disconnect)
-            self._source = self._open_source(self._runtime)
-        except BaseException as error:
-            self.close()
-            raise driver_error(self._name, error) from error
+        with driver_errors(self._name, is_open=False):
+            try:
+                self._runtime = Runtime(self._options.plugins, self._on_disconnect)
+                self._source = self._open_source(self._runtime)
+            except BaseException:
+                self.close()
+                raise
         if self._streams is not None and self._streams.device.uri in self._gone:
             self.close()
             raise DeviceNotFoundError(self._name, "it was unplugged while it was being opened")
@@ -191,7 +192,7 @@ class OpenNI2Camera:
             if source.ended:
                 raise DeviceFaultError(self._name, f"the recording ended after {source.pairs} exposures")
             return
-        with driver_errors(self._name):
+        with driver_errors(self._name, is_open=True):
             silent_s = source.silent_s()
         if silent_s > self._options.frame_timeout_s:
             raise DeviceTimeoutError(self._name, f"nothing usable for {silent_s:.1f} s: {source.describe()}")
@@ -206,7 +207,7 @@ class OpenNI2Camera:
         assert streams is not None
         assert runtime is not None
         device = streams.device
-        with driver_errors(self._name):
+        with driver_errors(self._name, is_open=True):
             facts = {
                 "library": f"OpenNI2 {runtime.version} with {', '.join(self._options.plugins)}",
                 "model": f"{device.vendor} {device.model}",
@@ -242,7 +243,7 @@ class OpenNI2Camera:
         assert streams is not None
         if with_ir and streams.infrared is None:
             raise DeviceFaultError(self._name, "IR is asked for, but options say infrared = false")
-        with driver_errors(self._name):
+        with driver_errors(self._name, is_open=True):
             mode = streams.depth_mode
             half_ns = round(5e8 * (self._exposure_s or 1 / max(1, mode.fps)))
             deadline_ns = max(not_before_ns, self._clock.now_ns()) + round(timeout_s * 1e9)
@@ -273,7 +274,7 @@ class OpenNI2Camera:
         uri = options.device if options.file_path is None else str(options.file_path)
         wanted = _FORMATS[options.depth_unit] if options.file_path is None else None
         self._streams = open_streams(runtime, uri, options.serial, wanted, options.infrared)
-        pair_us = min(round(options.pair_ms * 1000), 499_999 // max(1, self._streams.depth_mode.fps))
+        pair_us = round(options.pair_ms * 1000)
         if options.file_path is not None:
             playback = Playback(self._streams, pair_us)
             playback.start()
@@ -331,7 +332,7 @@ def record_oni(
     checked = validate(Options, options, name)
     if exposures < 1 or not 0 < timeout_s < math.inf or checked.file_path is not None:
         raise InputError(f"{exposures} exposures in {timeout_s} s of a device, allowed are from 1, above 0")
-    with driver_errors(name):
+    with driver_errors(name, is_open=False):
         runtime = Runtime((*checked.plugins, "OniFile"))
         try:
             unit, pair_us = _FORMATS[checked.depth_unit], round(checked.pair_ms * 1000)

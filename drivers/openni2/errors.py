@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundError, DriverUnavailableError
+from drivers.errors import (
+    DeviceFaultError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DriverError,
+    DriverUnavailableError,
+)
 
 _OUT_OF_FLOW = 5  # api.Status.OUT_OF_FLOW: what cannot be done now, as something else is under way
 
@@ -42,8 +48,7 @@ class BrokenError(Exception):
     """What the device sends, or what the file holds, cannot be used."""
 
 
-def driver_error(name: str, error: BaseException) -> BaseException:
-    """Returns one of the five errors for what the binding raised, and anything else as it is."""
+def _driver_error(name: str, error: Exception, is_open: bool) -> DriverError:
     match error:
         case PluginMissingError():
             return DriverUnavailableError(name, str(error))
@@ -52,16 +57,20 @@ def driver_error(name: str, error: BaseException) -> BaseException:
         case HangingError():
             return DeviceLostError(name, str(error))
         case OpenNI2Error() if error.status != _OUT_OF_FLOW:
-            return DeviceNotFoundError(name, str(error))
-        case SettingError() | BrokenError() | OpenNI2Error():
+            return (DeviceLostError if is_open else DeviceNotFoundError)(name, str(error))
+        case _:  # a setting, impossible data, or a library that something else uses
             return DeviceFaultError(name, str(error))
-    return error
 
 
 @contextmanager
-def driver_errors(name: str) -> Iterator[None]:
-    """Makes one of the five errors of what the binding raises inside."""
+def driver_errors(name: str, *, is_open: bool) -> Iterator[None]:
+    """Makes one of the drivers' five errors of what the binding raises inside.
+
+    Args:
+        name: The device's.
+        is_open: Whether it was open before: then a call that fails is a loss, else nothing was found.
+    """
     try:
         yield
     except (PluginMissingError, SettingError, OpenNI2Error, GoneError, BrokenError) as error:
-        raise driver_error(name, error) from error
+        raise _driver_error(name, error, is_open) from error

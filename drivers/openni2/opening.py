@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from drivers.openni2.api import DeviceProperty, PixelFormat, Sensor, Status, StreamProperty
 from drivers.openni2.device import Device, Mode, Stream
 from drivers.openni2.errors import OpenNI2Error, SettingError
-from drivers.openni2.pairs import unit_um
+from drivers.openni2.pairs import Pairing, unit_um
 from drivers.openni2.runtime import Runtime
 
 ANY = "any"
@@ -36,6 +36,10 @@ class Streams:
     def all(self) -> list[Stream]:
         """Those that there are."""
         return [self.depth] if self.infrared is None else [self.depth, self.infrared]
+
+    def pairing(self, tolerance_us: int) -> Pairing:
+        """Returns what pairs these streams' images: within the tolerance, and never half a period apart."""
+        return Pairing(self.infrared is not None, min(tolerance_us, 499_999 // max(1, self.depth_mode.fps)))
 
     def describe(self) -> str:
         """Returns size, rate, units and the factory's field of view, in words.

@@ -13,7 +13,7 @@ from ctypes import c_float, c_int
 from drivers.openni2.api import DeviceProperty, Sensor, StreamProperty
 from drivers.openni2.errors import BrokenError
 from drivers.openni2.opening import Streams
-from drivers.openni2.pairs import Pair, Pairing
+from drivers.openni2.pairs import Pair
 
 _BY_HAND = -1.0
 _UNKNOWN = 0xFFFFFFFF  # of frames, in a recording that was cut off
@@ -34,7 +34,7 @@ class Playback:
 
     def __init__(self, streams: Streams, pair_tolerance_us: int) -> None:
         self._streams = streams
-        self._pairing = Pairing(streams.infrared is not None, pair_tolerance_us)
+        self._pairing = streams.pairing(pair_tolerance_us)
         number = StreamProperty.NUMBER_OF_FRAMES
         counts = [(stream.integer(number) or 0) % 2**32 for stream in streams.all]
         self.frames = None if _UNKNOWN in counts else min(counts)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from drivers.device_clock import DeviceClock
 from drivers.openni2.errors import BrokenError, GoneError, HangingError, OpenNI2Error
 from drivers.openni2.opening import Streams
-from drivers.openni2.pairs import Pair, Pairing
+from drivers.openni2.pairs import Pair
 
 KEPT = 4  # exposures that nobody has asked for yet; the oldest goes first
 _WAIT_S = 0.05  # other calls have to wait for so long
@@ -42,7 +42,7 @@ class Reader:
 
     def __init__(self, streams: Streams, clock: DeviceClock, pair_tolerance_us: int) -> None:
         self._streams, self._clock = streams, clock
-        self._pairing = Pairing(streams.infrared is not None, pair_tolerance_us)
+        self._pairing = streams.pairing(pair_tolerance_us)
         self._changed = threading.Condition()  # guards all below, and the clock
         self._kept = deque[Pair](maxlen=KEPT)
         self._failure: Exception | None = None

@@ -85,7 +85,7 @@ def _record(
     try:
         for stream in streams.all:  # before frames come: the runtime's locks can block each other
             runtime.api.must("recording", "RecorderAttachStream", recorder, stream.handle, 0)
-        pairing = Pairing(True, tolerance_us)
+        pairing = streams.pairing(tolerance_us)
         deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         for stream in streams.all:
             stream.start()
