@@ -116,7 +116,7 @@ class FrameCount:
     """Numbers frames upwards, whatever the device's own counter does.
 
     Attributes:
-        missing: Frames that the device counted and that never came, while each was waited for.
+        missing: Frames that the device counted and that were not numbered, while each was waited for.
     """
 
     def __init__(self) -> None:

@@ -140,7 +140,8 @@ class AravisCamera:
             DeviceLostError: If it is not open.
         """
         session = self._opened()
-        status = f"{session.frames} frames, {session.incomplete} incomplete, {session.count.missing} missing"
+        missing = max(0, session.count.missing - session.incomplete)
+        status = f"{session.frames} frames, {session.incomplete} incomplete, {missing} missing"
         return {**session.facts, "clock": session.exposures.clock.describe(), "status": status}
 
     def grab(self, not_before_ns: int, timeout_s: float) -> ColourFrame:
@@ -213,8 +214,7 @@ class AravisCamera:
                 if not left_s:
                     raise DeviceTimeoutError(self._name, "no frame came in time")
             elif not buffer.complete:
-                session.incomplete += 1
-                session.count.number(buffer.frame_id)
+                session.incomplete += 1  # its frame id may be that of an older one
                 _log.debug("%s: frame %d: %s", self._name, buffer.frame_id, buffer.status)
                 if trigger is not None:
                     return None

@@ -63,21 +63,20 @@ def lost_within(call):
 
 def test_killed_between_two_frames_it_is_lost_and_resumes_with_frames_of_its_new_life(process):
     with make() as camera:
-        for _ in range(2):
-            grab(camera)
-            killed_ns = time.monotonic_ns()
-            process.kill()
-            error, _ = lost_within(camera.check)
-            assert isinstance(error, DeviceLostError)
-            with pytest.raises(DeviceLostError):
-                grab(camera, 0.2)
-            camera.close()
-            process.start()
-            back_ns = time.monotonic_ns()
-            camera.open()
-            frame = grab(camera)
-            assert (time.monotonic_ns() - back_ns) / 1e9 < 5
-            assert frame.t_ns - frame.t_sd_ns > killed_ns
+        grab(camera)
+        killed_ns = time.monotonic_ns()
+        process.kill()
+        error, _ = lost_within(camera.check)
+        assert isinstance(error, DeviceLostError)
+        with pytest.raises(DeviceLostError):
+            grab(camera, 0.2)
+        camera.close()
+        process.start()
+        back_ns = time.monotonic_ns()
+        camera.open()
+        frame = grab(camera)
+        assert (time.monotonic_ns() - back_ns) / 1e9 < 5
+        assert frame.t_ns - frame.t_sd_ns > killed_ns
 
 
 def test_killed_during_a_grab_it_is_lost_before_the_grab_is_over(process):
@@ -121,12 +120,13 @@ def test_a_camera_that_was_reset_behind_our_back_is_lost(process):
 def test_lost_packets_cost_frames_but_no_frame_has_holes(process):
     with make(region=(0, 0, 64, 48), pixel_format="BayerRG16", packet_bytes=576) as camera:
         whole = grab(camera).rgb
-        process.tell("lose 0.03")
-        for _ in range(12):
+        process.tell("lose 0.05")
+        status, taken = "", 0
+        while taken < 4 or (" 0 incomplete" in status and taken < 100):
             rgb = grab(camera, 20.0).rgb
             assert np.abs(rgb.astype(int).mean() - whole.astype(int).mean()) < 0.2 * whole.mean()
             assert (rgb.reshape(48, -1).max(axis=1) > 0).all()
-        status = camera.about()["status"]
+            status, taken = camera.about()["status"], taken + 1
     assert re.fullmatch(r"\d+ frames, [1-9]\d* incomplete, 0 missing", status), status
 
 
