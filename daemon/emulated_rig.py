@@ -58,7 +58,7 @@ def run_cell(
     with console.status(f"making the scene {scene}"):
         cell = make(scene, seed)
     places = Places(folder.resolve(), _free_port())
-    with CellServer(cell, places.socket, make):
+    with CellServer(cell, places.socket, make) as server:
         devices = [Emulator(name, arguments) for name, arguments in places.commands().items()]
         try:
             for device in devices:
@@ -67,6 +67,7 @@ def run_cell(
             _tell(folder, devices)
             write_atomically(folder / DEVICES, places.tables().encode())
             while not stop.wait(_LOOK_S):
+                server.cell.prepare()
                 changed = [device.name for device in devices if device.revive(restart_s)]
                 if changed:
                     _tell(folder, devices)
@@ -197,8 +198,9 @@ _TABLES = """\
 backend = "aravis"
 serial = "{camera}"
 address = "127.0.0.1"
-exposure_us = 10000
+exposure_us = 10000.0
 gain_db = 0.0
+packet_bytes = 8000
 
 [depth]
 backend = "openni2"

@@ -17,10 +17,17 @@ KINDS = ("colour", "depth", "light", "arm")
 # yet; it raises ConfigurationError for options that it does not know.
 _TABLE = {
     ("colour", "sim"): "drivers.sim.backend:colour",
+    ("colour", "aravis"): "drivers.colour_aravis:colour",
+    ("colour", "iidc"): "drivers.colour_iidc:colour",
     ("colour", "v4l2"): "drivers.colour_v4l2:colour",
     ("depth", "sim"): "drivers.sim.backend:depth",
+    ("depth", "openni2"): "drivers.depth_openni2:depth",
     ("light", "sim"): "drivers.sim.backend:light",
+    ("light", "gardasoft"): "drivers.light_gardasoft:light",
     ("arm", "sim"): "drivers.sim.backend:arm",
+    ("arm", "bcap"): "drivers.arm_bcap:arm",
+    ("arm", "can"): "drivers.arm_can:dbc",
+    ("arm", "canopen"): "drivers.arm_can:canopen",
 }
 
 

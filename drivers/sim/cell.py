@@ -16,6 +16,7 @@ from surfclass.types import Float64
 
 # What the arm's programme waits after a capture: long enough for its last joint reading.
 _DWELL_S = 0.3
+_STILL_NS = 50_000_000
 
 
 class Cell(Protocol):
@@ -113,6 +114,16 @@ class WorldCell:
     def depth(self, t_ns: int, key: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """As `Cell.depth`."""
         return self.world.render_depth(self.world.joints(t_ns), key)
+
+    def prepare(self) -> None:
+        """Where the arm stands still, computes what the next colour image from there needs.
+
+        For an emulated camera whose library answers nothing while it waits for pixels.
+        """
+        now_ns = time.monotonic_ns()
+        q = self.world.joints(now_ns)
+        if (q == self.world.joints(now_ns - _STILL_NS)).all():
+            self.world.renderer.prepare(self.world.base_T_rgb(q))
 
     def bake(self) -> None:
         """Makes all textures now, so that no exposure has to wait for one."""

@@ -57,6 +57,11 @@ class Renderer:
         image *= self.package.vignetting[..., None]
         return image * np.float32(exposure_s / self.package.nominal_exposure_s)
 
+    def prepare(self, base_T_rgb: Transform) -> None:
+        """Does now what the next colour image from there would have to wait for."""
+        with self._lock:
+            self._radiance(base_T_rgb)
+
     def colour(
         self,
         base_T_rgb: Transform,
