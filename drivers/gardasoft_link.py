@@ -10,7 +10,7 @@ import time
 from typing import Protocol
 
 from drivers import gardasoft
-from drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError, DriverError
 from drivers.gardasoft import Event, GardasoftError, Reply, ReplyReader, Version
 
 _CHUNK = 4096
@@ -159,22 +159,27 @@ class GardasoftLink:
         """Whether the next answer is known to be to the next question."""
         return self._in_step
 
-    def open(self) -> None:
+    def open(self, first: bytes) -> None:
         """Opens the transport and finds out what answers there.
+
+        Args:
+            first: A command that is told before anything is asked, and again if nobody answers.
 
         Raises:
             DeviceNotFoundError: If there is nothing, or it does not answer as these controllers do.
             DeviceFaultError, DriverUnavailableError: As the transport.
         """
         self.transport.open()
-        self._reader, self._answers, self._events, self._in_step = ReplyReader(), [], [], False
+        self._reader, self._answers, self._events = ReplyReader(), [], []
         try:
+            self.tell(first)
             self._get_in_step(time.monotonic() + self.timeout_s)
-        except (DeviceTimeoutError, DeviceLostError) as error:
+        except BaseException as error:
+            with contextlib.suppress(DriverError):
+                self.tell(first)
             self.transport.close()
-            raise DeviceNotFoundError(self.name, f"no light controller answers: {error}") from error
-        except BaseException:
-            self.transport.close()
+            if isinstance(error, DeviceTimeoutError | DeviceLostError):
+                raise DeviceNotFoundError(self.name, f"no light controller answers: {error}") from error
             raise
 
     def close(self) -> None:

@@ -69,6 +69,7 @@ class GardasoftLight:
     ) -> None:
         self._name, self._clock, self._options = name, clock, options
         self._link = GardasoftLink(name, transport or _transport(name, options), options.reply_timeout_s)
+        self._off = gardasoft.continuous(options.channel, 0)
         self._lock = threading.RLock()  # the caller's thread and the timer's
         self._channel = GardasoftChannel(self._link, options.channel)
         self._timer = OnTimer(f"{name} off", self._expire)
@@ -77,8 +78,8 @@ class GardasoftLight:
         self._percent = 0.0  # as set last
         self._lit = False  # it may shine: it was told to, and has not confirmed that it is off again
         self._dark_by = 0.0  # time.monotonic() at which the timer puts it out
-        self._reason: str | None = None  # what is then wrong, where somebody must be told
-        self._overrun: str | None = None  # what was wrong, until somebody was told
+        self._is_overdue = False  # whether that would be because nobody else did
+        self._trouble: tuple[type[DriverError], str] | None = None  # met by the timer, until a call tells it
 
     @property
     def name(self) -> str:
@@ -106,10 +107,11 @@ class GardasoftLight:
         if self._is_open:
             return
         with self._lock:
-            self._link.open()
+            self._link.open(self._off)
             self._channel = GardasoftChannel(self._link, self._options.channel)  # knows of no fault
             try:
                 self._prepare()
+                self._clock.sleep(self._options.settle_ms / 1e3)
             except BaseException as error:
                 self._put_out()
                 self._link.close()
@@ -118,7 +120,6 @@ class GardasoftLight:
                 raise
             self._is_open = True
             self._timer.open()
-        self._clock.sleep(self._options.settle_ms / 1e3)
 
     def close(self) -> None:
         """Puts the light out, waits for its answer (for about four reply timeouts), and disconnects."""
@@ -166,11 +167,11 @@ class GardasoftLight:
             self._must_be_usable()
             try:
                 if level > 0:
-                    self._raise_overrun()
+                    self._tell_trouble()
                     self._light_up(level)
                 else:
                     self._put_out_and_know()
-                    self._raise_overrun()
+                    self._tell_trouble()
             except BaseException:
                 self._put_out()
                 raise
@@ -187,8 +188,7 @@ class GardasoftLight:
         with self._lock:
             self._must_be_usable()
             try:
-                if self._overrun is not None:
-                    raise DeviceTimeoutError(self._name, self._overrun)
+                self._tell_trouble(forget=False)  # the capture that it befell, or the next, must fail
                 self._channel.read_status(_CHECK_S)
                 self._channel.must_have(self._percent)
             except BaseException:
@@ -199,7 +199,9 @@ class GardasoftLight:
         """Tells what answers, and what was set."""
         options, version = self._options, self._link.version
         library = f"pyserial {metadata.version('pyserial')}" if options.port_path else "sockets"
-        told = ", ".join(f"{key} {value}".strip() for key, value in self._channel.status.items())
+        status = ", ".join(f"{key} {value}".strip() for key, value in self._channel.status.items())
+        trip = self._link.round_trip_s
+        told = [status, *self._channel.notes, f"answers in {trip * 1e3:.1f} ms" if trip is not None else ""]
         facts = {
             "library": library,
             "model": version.model if version else "",
@@ -208,7 +210,7 @@ class GardasoftLight:
             "settings": f"channel {options.channel}, {options.mode}, rated {options.rating}"
             f"{'' if self._rating_confirmed else ' (not read back)'}, full level {options.max_percent:g} %, "
             f"off after {options.max_on_s:g} s",
-            "status": "; ".join([*([told] if told else []), *self._channel.notes]),
+            "status": "; ".join(fact for fact in told if fact),
         }
         return {key: fact for key, fact in facts.items() if fact}
 
@@ -216,8 +218,8 @@ class GardasoftLight:
 
     def _prepare(self) -> None:
         options, channel, link = self._options, self._channel, self._link
-        self._percent, self._reason, self._overrun = 0.0, None, None
-        first = link.ask(gardasoft.continuous(options.channel, 0))  # before anything, whatever it says to it
+        self._percent, self._is_overdue, self._trouble = 0.0, False, None
+        first = link.ask(self._off)  # whatever it says to it
         before = link.ask(gardasoft.clear())
         events = [event.text for event in (*first.events, *before.events)]
         errors = [error_text(number) for number in dict.fromkeys((*first.errors, *before.errors))]
@@ -239,7 +241,7 @@ class GardasoftLight:
         options = self._options
         percent = max(_PERCENT_STEP, round(level * options.max_percent, 1))
         self._lit, self._dark_by = True, time.monotonic() + options.max_on_s
-        self._reason = f"it was on for longer than max_on_s = {options.max_on_s:g} s and was put out"
+        self._is_overdue = True
         self._timer.set(options.max_on_s)
         if options.mode == "strobe":
             width_s, delay_s = options.pulse_width_ms / 1e3, options.pulse_delay_ms / 1e3
@@ -259,18 +261,17 @@ class GardasoftLight:
 
     def _put_out_and_know(self) -> None:
         """Puts the light out, and raises what else the answer says."""
-        command = gardasoft.continuous(self._options.channel, 0)
-        reply = self._link.ask(command)
+        reply = self._link.ask(self._off)
         if not reply.lines and _DARK_ANYWAY.issuperset(reply.errors):
-            self._lit, self._percent, self._reason = False, 0.0, None
+            self._lit, self._percent, self._is_overdue = False, 0.0, False
             self._timer.set(None)
-        self._channel.judge(reply, command)
+        self._channel.judge(reply, self._off)
 
     def _put_out(self) -> None:
         """Tells the light to go off without waiting for an answer; the timer then asks until it has one."""
         with contextlib.suppress(DriverError):
-            self._link.tell(gardasoft.continuous(self._options.channel, 0))
-        self._lit, self._dark_by, self._reason = True, time.monotonic() + _AGAIN_S, None
+            self._link.tell(self._off)
+        self._lit, self._dark_by, self._is_overdue = True, time.monotonic() + _AGAIN_S, False
         self._timer.set(_AGAIN_S)
 
     def _put_out_for_good(self) -> None:
@@ -289,7 +290,7 @@ class GardasoftLight:
                 connected_again = True
                 self._link.close()
                 try:
-                    self._link.open()
+                    self._link.open(self._off)
                 except DriverError:
                     break
             except DeviceTimeoutError:
@@ -310,11 +311,16 @@ class GardasoftLight:
             left = self._dark_by - time.monotonic()
             if left > 0:
                 return left
-            if self._reason is not None:
-                self._overrun, self._reason = self._reason, None
-                _log.error("%s: %s", self._name, self._overrun)
-            with contextlib.suppress(DriverError):  # the next call meets the same trouble, and tells it
+            if self._is_overdue:
+                message = f"it was on for longer than max_on_s = {self._options.max_on_s:g} s and was put out"
+                _log.error("%s: %s", self._name, message)
+                self._trouble, self._is_overdue = (DeviceTimeoutError, message), False
+            try:
                 self._put_out_and_know()
+            except DriverError as error:
+                # Without an answer the next call meets the same trouble; what was answered it would not.
+                if not self._lit and self._trouble is None:
+                    self._trouble = type(error), str(error).removeprefix(f"{self._name}: ")
             return _AGAIN_S if self._lit else None
 
     def _must_be_usable(self) -> None:
@@ -325,10 +331,12 @@ class GardasoftLight:
                 self._name, f"{self._channel.fault}; it stays off until it is closed and opened again"
             )
 
-    def _raise_overrun(self) -> None:
-        overrun, self._overrun = self._overrun, None
-        if overrun is not None:
-            raise DeviceTimeoutError(self._name, overrun)
+    def _tell_trouble(self, forget: bool = True) -> None:
+        trouble = self._trouble
+        if forget:
+            self._trouble = None
+        if trouble is not None:
+            raise trouble[0](self._name, trouble[1])
 
 
 def _transport(name: str, options: LightOptions) -> Transport:

@@ -21,7 +21,7 @@ from drivers.errors import (
 )
 from drivers.gardasoft_options import LightOptions
 from drivers.light_gardasoft import GardasoftLight
-from drivers.sim.led_controller import LedController, WireFaults
+from drivers.sim.led_controller import LedController
 from drivers.sim.led_outputs import LedOutputs
 from surfclass.errors import ConfigurationError
 
@@ -41,7 +41,12 @@ def made(controller):
     with contextlib.ExitStack() as closing:
 
         def make(**options):
-            options = {"port_path": str(controller.link_path), "rating_a": 0.7, **options}
+            options = {
+                "port_path": str(controller.link_path),
+                "rating_a": 0.7,
+                "reply_timeout_s": 1.0,
+                **options,
+            }
             light = backends.create("light", "gardasoft", clock=SystemClock(), options=options)
             closing.callback(light.close)
             return light
@@ -109,8 +114,9 @@ class TestOptions:
 
 class TestOpening:
     def test_puts_out_first_then_clears_then_rates(self, controller, light):
-        assert controller.commands[0].startswith("VR;VR")
-        assert controller.commands[1:] == ["RS1,0", "GR", "GR", "GT1", "VL1,0,0.7", "RS1,0", "ST1"]
+        assert controller.commands[1].startswith("VR;VR")
+        assert controller.commands[0] == "RS1,0"
+        assert controller.commands[2:] == ["RS1,0", "GR", "GR", "GT1", "VL1,0,0.7", "RS1,0", "ST1"]
 
     def test_a_light_that_shone_is_put_out(self, controller, made):
         controller.outputs.execute(b"VL1,0,0.5;RS1,80")
@@ -179,9 +185,9 @@ class TestLevels:
         assert controller.outputs.history.at(holds_ns) == 1.0
 
     def test_a_late_prompt_is_not_taken_for_the_next_one(self, controller, made):
-        light = made(reply_timeout_s=0.15)
+        light = made(reply_timeout_s=0.3)
         light.open()
-        controller.faults.late_s = 0.4
+        controller.faults.late_s = 0.6
         with pytest.raises(DeviceTimeoutError):
             light.set_level(0.5)
         controller.faults.late_s = 0.0
@@ -210,10 +216,20 @@ class TestLevels:
             light.set_level(0.8)
         until(lambda: controller.outputs.level == 0)
 
+    def test_a_level_that_is_not_confirmed_is_put_out_at_once(self, controller, made):
+        light = made(reply_timeout_s=0.3)
+        light.open()
+        controller.faults.mute = "dumb"
+        with pytest.raises(DeviceTimeoutError):
+            light.set_level(1.0)
+        until(lambda: "RS1,100" in controller.commands and controller.outputs.level == 0)
+        assert controller.commands[controller.commands.index("RS1,100") + 1] == "RS1,0"
+
     def test_an_error_number_is_told_with_the_command_and_its_meaning(self, controller, light):
         controller.faults.error = 2
         with pytest.raises(DeviceFaultError, match=r"RS1,100: Err 2: the command is not recognised"):
             light.set_level(1.0)
+        controller.faults.error = None
 
 
 class TestStrobe:
@@ -261,7 +277,7 @@ class TestStrobe:
 
 
 class TestFaults:
-    @pytest.mark.parametrize("number", [40, 41, 44, 45, 46, 47, 8, 12])
+    @pytest.mark.parametrize("number", [40, 47, 8])
     def test_fatal_errors_stay_until_it_is_opened_anew(self, controller, light, number):
         controller.faults.error = number
         with pytest.raises(DeviceFaultError, match=f"Err {number}"):
@@ -316,8 +332,6 @@ class TestFaults:
     def test_the_light_s_troubles_fail_one_call(self, controller, light, code, error):
         light.set_level(1.0)
         controller.event(code)
-        until(lambda: not controller.outputs._untold)
-        time.sleep(0.05)
         with pytest.raises(error, match=f"event {code}"):
             light.set_level(0.0)
         assert controller.outputs.level == 0
@@ -325,8 +339,6 @@ class TestFaults:
 
     def test_another_channel_s_troubles_are_noted(self, controller, light):
         controller.event(140, channel=2)
-        until(lambda: not controller.outputs._untold)
-        time.sleep(0.05)
         light.check()
         assert "event 140 of channel 2" in light.about()["status"]
 
@@ -364,6 +376,16 @@ class TestLimitOfTime:
             light.set_level(0.0)
         light.set_level(0.0)
 
+    def test_what_the_controller_said_to_the_timer_is_told_too(self, controller, made):
+        light = made(max_on_s=0.1)
+        light.open()
+        light._put_out()  # as after a call that failed: the timer asks until there is an answer
+        controller.event(132)
+        until(lambda: not light._lit)
+        with pytest.raises(DeviceFaultError, match=r"^light: event 132"):
+            light.set_level(1.0)
+        light.set_level(1.0)
+
     def test_counts_from_the_last_level(self, controller, made):
         light = made(max_on_s=2.0)
         light.open()
@@ -373,7 +395,7 @@ class TestLimitOfTime:
         assert light._timer._due is None
 
     def test_it_goes_on_telling_a_controller_that_does_not_answer(self, controller, made):
-        light = made(max_on_s=0.1, reply_timeout_s=0.1)
+        light = made(max_on_s=0.1, reply_timeout_s=0.3)
         light.open()
         light.set_level(1.0)
         controller.faults.mute = "deaf"
@@ -405,7 +427,7 @@ class TestLoss:
         assert controller.outputs.level == 0
 
     def test_a_controller_that_hears_but_does_not_answer_is_put_out(self, controller, made):
-        light = made(reply_timeout_s=0.1)
+        light = made(reply_timeout_s=0.3)
         light.open()
         light.set_level(1.0)
         controller.faults.mute = "dumb"
@@ -414,8 +436,17 @@ class TestLoss:
         assert time.monotonic() - before < 5
         assert controller.outputs.level == 0
 
+    def test_closing_puts_out_blindly_where_the_answers_are_not_to_be_told_apart(self, controller, made):
+        light = made(reply_timeout_s=0.3)
+        light.open()
+        light.set_level(1.0)
+        light._link.distrust()
+        controller.faults.mute = "dumb"
+        light.close()
+        assert controller.outputs.level == 0
+
     def test_closing_gives_up_on_a_controller_that_is_deaf(self, controller, made, caplog):
-        light = made(reply_timeout_s=0.05)
+        light = made(reply_timeout_s=0.3)
         light.open()
         light.set_level(1.0)
         controller.faults.mute = "deaf"
@@ -578,6 +609,7 @@ class TestEveryStep:
     def test_the_light_is_off_whichever_operation_fails(self, how, mode):
         for at in itertools.count():
             outputs = LedOutputs()
+            outputs.execute(b"VL1,0,1;RS1,100")  # as somebody else left it
             wire = FailingWire(outputs, how, at)
             self.session(wire, mode)
             assert outputs.level == 0, f"operation {at}"
@@ -599,7 +631,3 @@ class TestEveryStep:
 
     def test_without_a_failure_nothing_fails(self):
         assert self.session(FailingWire(LedOutputs(), "lost", 10_000), "continuous")
-
-
-def test_wire_faults_start_harmless():
-    assert WireFaults() == WireFaults(mute="", garbage=False, half=False, late_s=0.0, error=None, event=None)

@@ -169,6 +169,9 @@ class LedController:
             self._master, self._slave = -1, -1
             for opened in (*self._sockets.values(), self._listener, self._datagrams):
                 if opened is not None:
+                    # The thread's poll() holds a closed socket a moment longer: shut down, it is dead now.
+                    with contextlib.suppress(OSError):
+                        opened.shutdown(socket.SHUT_RDWR)
                     opened.close()
             self._sockets, self._listener, self._datagrams = {}, None, None
             self._clients, self._network, self._due = {}, None, []
