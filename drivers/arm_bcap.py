@@ -33,6 +33,7 @@ _HISTORY_S = 2.0
 _STALE_S = 0.5  # without a reading for so long, an idle arm is not well
 _FAULTY_RUN = 5  # so many impossible readings in a row are no accident
 _RETRY_PAUSE_S = 0.02
+_SAME_STAMP_PAUSE_S = 0.001
 
 _log = logging.getLogger("surfclass.arm")
 
@@ -232,14 +233,19 @@ class BcapArm:
     def _read_on(self, session: ArmSession) -> None:
         period_s = 1 / self._options.rate_hz
         next_s = time.monotonic()
+        in_vain = 0
         while not self._stopping.is_set():
-            next_s = max(next_s + period_s, time.monotonic())
+            now_s = time.monotonic()
+            # In step, unless it is behind, or readings that were asked for put it ahead.
+            next_s = min(max(next_s + period_s, now_s), now_s + period_s)
             try:
-                self._take(session.read())
+                in_vain = 0 if self._take(session.read()) else in_vain + 1
             except DeviceTimeoutError as error:
                 self._timeouts += 1
                 self._history.why = str(error).removeprefix(f"{self._name}: ")
-            if self._wanted.wait(max(0.0, next_s - time.monotonic())):
+            # Two readings in the same ms of the controller's clock are one; the next ms brings another.
+            pause_s = _SAME_STAMP_PAUSE_S if in_vain == 1 else next_s - time.monotonic()
+            if self._wanted.wait(max(0.0, pause_s)):
                 self._wanted.clear()
 
     def _take(self, reading: Reading) -> bool:

@@ -349,6 +349,14 @@ def test_it_reads_by_itself_as_often_as_it_is_told(controller):
         device.check()
 
 
+def test_readings_that_were_asked_for_do_not_put_off_the_others(controller):
+    with made_arm(controller) as device:
+        for _ in range(200):
+            device.read_joints(PATIENT_S)
+        first = len(controller.calls)
+        eventually(lambda: len(controller.calls) > first + 10, within_s=1.0)
+
+
 def test_no_session_left_is_tried_again_later(controller):
     controller._max_sessions = 1
     with made_arm(controller), pytest.raises(DeviceNotFoundError, match="0x8000090B"):

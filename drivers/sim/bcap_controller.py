@@ -180,12 +180,12 @@ class BcapController:
 
     def _serve_line(self, stop: _Stop, master: int) -> None:
         peer = self._peer(stop, partial(_write, master), "serial")
-        buffer, heard_s = bytearray(), 0.0
-        while stop.waits_for(master):
-            if time.monotonic() - heard_s > _PAUSE_S:
-                buffer.clear()  # what comes now is another request
-            buffer += os.read(master, _READ_SIZE)
-            heard_s = time.monotonic()
+        buffer = bytearray()
+        while stop.waits_for(master, _PAUSE_S if buffer else None):
+            data = _read(master)
+            if not data:
+                buffer.clear()  # a pause: what comes next is another request
+            buffer += data
             peer.take_serial(buffer)
 
 
@@ -205,12 +205,12 @@ class _Stop:
         self.event.set()
         self._raised.close()  # the other end is readable from now on, to all
 
-    def waits_for(self, number: int) -> bool:
-        """Returns True once a file can be read, and False once this is set."""
+    def waits_for(self, number: int, timeout_s: float | None = None) -> bool:
+        """Returns True once a file can be read or the time is over, and False once this is set."""
         poll = select.poll()
         for each in (number, self._seen.fileno()):
             poll.register(each, select.POLLIN)
-        poll.poll()
+        poll.poll(None if timeout_s is None else timeout_s * 1e3)
         return not self.event.is_set()
 
     def close(self) -> None:
@@ -245,6 +245,13 @@ def _is_over(peer: Peer) -> bool:
 def _send_to(made: socket.socket, address: tuple[str, int], data: bytes) -> None:
     with contextlib.suppress(OSError):  # the client went away: its next question never comes
         made.sendto(data, address)
+
+
+def _read(master: int) -> bytes:
+    """Returns what has come, if anything."""
+    with contextlib.suppress(BlockingIOError):
+        return os.read(master, _READ_SIZE)
+    return b""
 
 
 def _write(master: int, data: bytes) -> None:
