@@ -34,7 +34,6 @@ from surfclass.schema import validate
 _HISTORY_S = 2.0
 _SILENT_PERIODS = 10
 _SILENT_S = 0.2
-_GAP_S = 0.1
 _JOIN_S = 2.0
 
 
@@ -60,7 +59,7 @@ class CanArm:
         self._history = JointHistory(
             name,
             capacity=max(64, math.ceil(_HISTORY_S / period_s)),
-            max_gap_s=max(_GAP_S, 3 * period_s),
+            max_gap_s=options.max_gap_s,
         )
         self._silent_ns = round(max(_SILENT_S, _SILENT_PERIODS * period_s) * 1e9)
         self._bus: CanBus | None = None
@@ -87,14 +86,16 @@ class CanArm:
             return
         self._history.clear()
         self._faulty = self._gone = False
-        self._stop.clear()
+        self._stop = threading.Event()  # its own for each reader: one that hangs must not come back to life
         before = replace(self._source.counts)
         bus = CanBus(self.name, self._options, wanted=self._source.wanted, may_send=self._source.may_send)
         bus.open()
         try:
             began_ns = self._clock.now_ns()
             self._bus = bus
-            self._reader = threading.Thread(target=self._read, args=(bus,), name=f"{self.name}: CAN")
+            self._reader = threading.Thread(
+                target=self._read, args=(bus, self._stop), name=f"{self.name}: CAN", daemon=True
+            )
             self._reader.start()
             self._source.begin(bus, self)
             self._history.since(began_ns, self._options.open_timeout_s)
@@ -214,17 +215,17 @@ class CanArm:
     ) -> None:
         self.close()
 
-    def _read(self, bus: CanBus) -> None:
+    def _read(self, bus: CanBus, stop: threading.Event) -> None:
         reason = "the thread that reads the bus ended"
         try:
-            while not self._stop.is_set():
+            while not stop.is_set():
                 frame = bus.receive()
                 if frame is not None:
                     self._source.add(frame)
         except DeviceLostError as error:
             reason = self._bare(error)
         finally:
-            if not self._stop.is_set():
+            if not stop.is_set():
                 self.lost(reason)
 
     def _asked(self, ask: Callable[[int, float], JointState], t_ns: int, timeout_s: float) -> JointState:

@@ -109,7 +109,7 @@ class CanBus:
         self._can = _python_can(device)
         self._bus: can.BusABC | None = None
         self._lock_file: int | None = None
-        self._poll: select.poll | None = None
+        self._poll = select.poll()
         self._present_ns = 0
 
     @property
@@ -139,18 +139,17 @@ class CanBus:
             if self.options.interface in _ON_A_PORT:
                 self._lock_file = lock_port(self.device, str(self.options.channel).partition("@")[0])
             self._bus = self._opened()
+            self._poll = select.poll()
+            with contextlib.suppress(NotImplementedError, self._can.CanError):  # a bus that has no file
+                self._poll.register(self._bus.fileno(), 0)
         except BaseException:
             self.close()
             raise
         self.arrivals = Arrivals()
-        self._poll = None
-        with contextlib.suppress(NotImplementedError):  # a bus that has no file
-            self._poll = select.poll()
-            self._poll.register(self._bus.fileno(), 0)
 
     def close(self) -> None:
         """Closes the bus; never raises, may be called twice."""
-        bus, self._bus, self._poll = self._bus, None, None
+        bus, self._bus = self._bus, None
         if bus is not None:
             with contextlib.suppress(self._can.CanError, OSError, ValueError):
                 bus.shutdown()
@@ -276,7 +275,7 @@ class CanBus:
 
     def _must_be_there(self, bus: can.BusABC) -> None:
         """Looks whether a silent bus is there at all: some interfaces go on returning nothing."""
-        if self._poll is not None and any(event for _, event in self._poll.poll(0)):
+        if any(event for _, event in self._poll.poll(0)):
             raise DeviceLostError(self.device, f"{self.address}: unplugged")
         if self.options.interface == "socketcan" and (why := missing_interface(str(self.options.channel))):
             raise DeviceLostError(self.device, why)

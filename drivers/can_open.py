@@ -124,9 +124,11 @@ class CanopenJoints:
             for node in self._nodes.values():
                 node.nmt.send_command(_STARTED)
         if self._options.read == "sdo" or self._options.send_sync:
-            self._stop.clear()
+            self._stop = threading.Event()
             ask = self._read_all if self._options.read == "sdo" else self._send_sync
-            self._asker = threading.Thread(target=self._asks, args=(ask,), name=f"{self._device}: CANopen")
+            self._asker = threading.Thread(
+                target=self._asks, args=(ask, self._stop), name=f"{self._device}: CANopen", daemon=True
+            )
             self._asker.start()
 
     def add(self, frame: CanFrame) -> None:
@@ -258,15 +260,17 @@ class CanopenJoints:
         if not self._emergencies:
             self._listener.heard(joints)
 
-    def _asks(self, ask: Callable[[], None]) -> None:
+    def _asks(self, ask: Callable[[], None], stop: threading.Event) -> None:
         """Calls `ask` every period, in a thread of its own, until the bus takes nothing any more."""
         period_s = self._options.period_ms / 1e3
         due_s = time.monotonic()
         try:
-            while not self._stop.wait(max(0.0, due_s - time.monotonic())):
+            while not stop.wait(max(0.0, due_s - time.monotonic())):
                 ask()
                 due_s = max(due_s + period_s, time.monotonic())
         except DeviceLostError as error:
+            if stop.is_set():
+                return
             self._listener.lost(str(error).removeprefix(f"{self._device}: "))
 
     def _send_sync(self) -> None:

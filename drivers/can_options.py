@@ -77,6 +77,7 @@ class ReaderOptions(BusOptions):
         latency_ms: How long the angles are old when their SYNC or their frames arrive: the bridge's
             cycle, the adapter's buffer.
         latency_sd_ms: How far that can be off.
+        max_gap_s: Angles are interpolated between sets no further apart than this.
         open_timeout_s: How long open() waits for the first set.
         limits_deg: Lowest and highest angle of j1 to j6; what lies outside is a fault.
     """
@@ -85,8 +86,17 @@ class ReaderOptions(BusOptions):
     window_ms: Positive
     latency_ms: _NOT_BELOW_0 = 0.0
     latency_sd_ms: _NOT_BELOW_0 = 0.0
+    max_gap_s: Annotated[Positive, Field(le=2)] = 0.1
     open_timeout_s: Positive = 2.0
     limits_deg: tuple[Range, Range, Range, Range, Range, Range] = (_TURN,) * 6
+
+    @model_validator(mode="after")
+    def _sets_are_neighbours(self) -> ReaderOptions:
+        if self.max_gap_s < 2e-3 * self.period_ms:
+            raise ValueError(
+                f"max_gap_s: {self.max_gap_s:g}, allowed are two periods or more, {2e-3 * self.period_ms:g}"
+            )
+        return self
 
     @field_validator("limits_deg")
     @classmethod

@@ -11,6 +11,7 @@ from pathlib import Path
 from drivers.errors import DeviceNotFoundError, DriverUnavailableError
 
 _IFF_UP = 1
+_ARPHRD_CAN = 280
 _WHY = {
     errno.EAGAIN: "another program has it open; end that program",
     errno.EACCES: "no permission: the user must be in the port's group (dialout on Debian)",
@@ -59,10 +60,13 @@ def look_for_interface(device: str, channel: str) -> None:
 
 def missing_interface(channel: str) -> str:
     """Says why a network interface is not usable; empty where it is."""
+    folder = Path("/sys/class/net", channel)
     try:
-        flags = int(Path("/sys/class/net", channel, "flags").read_text(), 16)
+        kind, flags = int((folder / "type").read_text()), int((folder / "flags").read_text(), 16)
     except (OSError, ValueError):
         return f"socketcan {channel}: there is no such network interface"
+    if kind != _ARPHRD_CAN:
+        return f"socketcan {channel}: the network interface is no CAN bus"
     if not flags & _IFF_UP:
         return f"socketcan {channel}: the interface is down (`ip link set {channel} up`)"
     return ""

@@ -363,10 +363,13 @@ class TestAvailability:
         with pytest.raises(DriverUnavailableError, match="this kernel has no CAN"):
             can_site.reader(can_site.bridge_options("socketcan", "can0")).open()
 
-    def test_an_absent_network_interface_is_not_found(self, monkeypatch):
+    @pytest.mark.parametrize(
+        ("channel", "message"), [("nocan0", "no such network interface"), ("lo", "is no CAN bus")]
+    )
+    def test_an_absent_network_interface_is_not_found(self, monkeypatch, channel, message):
         monkeypatch.setattr(socket, "socket", lambda *_: SimpleNamespace(close=lambda: None))
-        with pytest.raises(DeviceNotFoundError, match="no such network interface"):
-            can_site.reader(can_site.bridge_options("socketcan", "nocan0")).open()
+        with pytest.raises(DeviceNotFoundError, match=message):
+            can_site.reader(can_site.bridge_options("socketcan", channel)).open()
 
     @pytest.mark.parametrize("interface", ["pcan", "kvaser", "gs_usb", "vector", "ixxat", "usb2can"])
     def test_a_make_whose_library_is_missing_is_unavailable(self, interface):

@@ -159,6 +159,7 @@ def test_extended_ids_are_other_frames_than_standard_ones(tmp_path):
         ({"bus": {"can_filters": 1}}, "bus: can_filters cannot be given here"),
         ({"windw_ms": 5}, "did you mean 'window_ms'"),
         ({"period_ms": 0}, "period_ms"),
+        ({"max_gap_s": 0.015}, "two periods or more, 0.02"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_with_what_is_allowed(more, message):

@@ -67,6 +67,20 @@ def test_a_frame_that_waited_while_the_clock_was_set_has_its_own_time():
         assert abs((span.begin_ns + span.end_ns) // 2 - received_ns) <= TOLERANCE_NS
 
 
+def test_a_small_step_is_doubted_only_until_the_frames_from_before_it_are_read():
+    clocks = Clocks({START_NS + 11_500_000: 600_000})
+    arrivals = arrivals_of(clocks)
+    widths = []
+    for received_ns in (START_NS + 11_000_000, START_NS + 12_000_000, START_NS + 20_000_000):
+        clocks.t_ns = received_ns + 1_500_000
+        span = arrivals.span(clocks.stamp(received_ns))
+        assert span.begin_ns - TOLERANCE_NS <= received_ns <= span.end_ns + TOLERANCE_NS
+        widths.append(span.end_ns - span.begin_ns)
+        arrivals.idle(clocks.t_ns)
+    assert max(widths[:2]) > 500_000, "either clock may have stamped them"
+    assert widths[2] <= TOLERANCE_NS + 500
+
+
 def test_a_stamp_of_another_clock_is_not_used():
     clocks = Clocks()
     arrivals = arrivals_of(clocks)

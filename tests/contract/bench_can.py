@@ -60,6 +60,7 @@ def bridge_options(**more: Any) -> dict[str, Any]:
         "period_ms": PERIOD_S * 1e3,
         "window_ms": 200.0,
         "open_timeout_s": OPEN_S,
+        "max_gap_s": 1.0,
         "dbc_path": str(DBC),
         "counter": "Counter",
         "joints": joints,
@@ -83,6 +84,7 @@ def node_options(**more: Any) -> dict[str, Any]:
         "window_ms": PERIOD_S * 1e3,
         "read": "pdo",
         "open_timeout_s": OPEN_S,
+        "max_gap_s": 1.0,
         "nodes": nodes,
         **more,
     }
