@@ -83,7 +83,8 @@ class IidcCamera:
         self._exposure: Exposure | None = None
         self._lost = ""
         self._due_ns: int | None = None  # until when the frame of a trigger that was given up may come
-        self._late = self._unasked = 0
+        self._seen_ready = False  # the camera, since its last trigger
+        self._late = self._missing = self._unasked = 0
 
     @property
     def name(self) -> str:
@@ -104,7 +105,8 @@ class IidcCamera:
             DeviceFaultError: If it cannot do what the options ask for, or does not keep it.
         """
         self.close()
-        self._lost, self._due_ns, self._late, self._unasked = "", None, 0, 0
+        self._lost, self._due_ns = "", None
+        self._late = self._missing = self._unasked = 0
         try:
             self._library = Library()
         except OSError as error:
@@ -185,7 +187,7 @@ class IidcCamera:
             "settings": f"{self._exposure.text}, trigger {self._options.trigger}",
             "clock": "the host's: the camera stamps nothing",
             "status": f"{stream.frames} frames, {stream.corrupt} corrupt, {self._late} too late, "
-            f"{self._unasked} not asked for",
+            f"{self._missing} missing, {self._unasked} not asked for",
         }
 
     def grab(self, not_before_ns: int, timeout_s: float) -> ColourFrame:
@@ -249,27 +251,51 @@ class IidcCamera:
 
     def _triggered(self, camera: Camera, stream: IidcStream, begin_ns: int, deadline_ns: int) -> ColourFrame:
         """Triggers at `begin_ns`, and again where the frame comes damaged or is lost."""
-        self._outwait_late_frame(stream, deadline_ns)
+        missed = "a frame of a trigger before is still under way"
+        if self._due_ns is not None and self._due_frame(camera, stream, deadline_ns, missed) is not None:
+            self._due_ns = None
+            self._late += 1
         stream.rest_until(begin_ns)
-        damaged = 0
+        missed, damaged = "no frame came in time", 0
         while True:
             while camera.number("software_trigger_get_power"):  # busy with an exposure
                 self._before(deadline_ns, "the camera was not ready for a trigger")
                 stream.rest_until(self._clock.now_ns() + round(_READY_POLL_S * 1e9))
             self._unasked += stream.clear()
             sent_ns = self._clock.now_ns()
-            self._due_ns = sent_ns + self._least_ns() + round(self._options.late_s * 1e9)
+            self._due_ns, self._seen_ready = sent_ns + self._least_ns() + self._late_ns(), False
             camera.call("software_trigger_set_power", 1)
-            while (arrival := stream.next(min(deadline_ns, self._due_ns))) is not None:
+            while (arrival := self._due_frame(camera, stream, deadline_ns, missed)) is not None:
                 if arrival.at_ns - sent_ns >= self._least_ns():
                     break
                 self._unasked += 1  # its exposure cannot have begun after the trigger
-            if arrival is not None:
-                self._due_ns = None
-                if arrival.image is not None:
-                    return self._frame(arrival, arrival.image, sent_ns)
+            self._due_ns = None
+            if arrival is None:
+                self._missing += 1
+            elif arrival.image is not None:
+                return self._frame(arrival, arrival.image, sent_ns)
+            else:
                 damaged += 1
-            self._before(deadline_ns, "no frame came in time" + f" ({damaged} came damaged)" * bool(damaged))
+                missed = f"no frame came in time, but {damaged} came damaged"
+            self._before(deadline_ns, missed)
+
+    def _due_frame(self, camera: Camera, stream: IidcStream, deadline_ns: int, missed: str) -> Arrival | None:
+        """Returns the next frame, or None once that of the last trigger will not come any more.
+
+        Its time counts from when the camera was seen to be ready again: a frame that is late is worse
+        than one that is lost, for the next trigger would be taken for its own.
+        """
+        while self._due_ns is not None:
+            arrival = stream.next(min(deadline_ns, self._due_ns))
+            if arrival is not None:
+                return arrival
+            self._before(deadline_ns, missed)
+            if self._seen_ready:
+                self._due_ns = None
+            else:
+                self._seen_ready = not camera.number("software_trigger_get_power")
+                self._due_ns = self._clock.now_ns() + self._late_ns()
+        return None
 
     def _running(self, stream: IidcStream, not_before_ns: int, deadline_ns: int) -> ColourFrame:
         """Waits for an exposure that the camera or a line begins."""
@@ -277,17 +303,6 @@ class IidcCamera:
             if arrival.image is not None and self._earliest_ns(arrival) >= not_before_ns:
                 return self._frame(arrival, arrival.image, self._earliest_ns(arrival))
         raise DeviceTimeoutError(self._name, "no frame came in time")
-
-    def _outwait_late_frame(self, stream: IidcStream, deadline_ns: int) -> None:
-        """Waits until the frame of a trigger that was given up has come or will not come any more."""
-        while self._due_ns is not None:
-            if stream.next(min(deadline_ns, self._due_ns)) is not None:
-                self._due_ns = None
-                self._late += 1
-            elif self._clock.now_ns() >= self._due_ns:
-                self._due_ns = None
-            else:
-                self._before(deadline_ns, "a frame from before is still under way")
 
     def _frame(self, arrival: Arrival, image: bytes, earliest_ns: int) -> ColourFrame:
         """The frame of an exposure that began at `earliest_ns` or later."""
@@ -316,6 +331,11 @@ class IidcCamera:
             t_sd_ns=(latest_ns - earliest_ns + 1) // 2,
             gain_db=exposure.gain_db,
         )
+
+    def _late_ns(self) -> int:
+        """How late the frame of a trigger may be."""
+        assert self._exposure is not None
+        return round((self._options.late_s + (self._exposure.period_s or 0.0)) * 1e9)
 
     def _least_ns(self) -> int:
         """From an exposure's begin until its frame is here, at least."""

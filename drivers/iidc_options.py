@@ -55,8 +55,9 @@ class IidcOptions(Table):
         readout_min_s: The least time from an exposure's end until its frame is here.
         readout_max_s: The greatest; None: a frame period without a trigger by software, where the
             sending of the trigger bounds the exposure's begin already.
-        late_s: A frame that is not here so long after its exposure does not come any more; until then
-            no other trigger is sent, or the one could be taken for the other.
+        late_s: A frame that is not here a frame period and so much after the camera was seen to be
+            ready again does not come any more. Until then no other trigger is sent: the late frame
+            would be taken for its.
     """
 
     guid: Annotated[str, Field(pattern=r"^(0[xX])?[0-9a-fA-F]{1,16}$")] | None = None
@@ -84,7 +85,7 @@ class IidcOptions(Table):
     buffers: Annotated[int, Field(ge=2, le=32)] = 4
     readout_min_s: Annotated[Number, Field(ge=0)] = 0.0
     readout_max_s: Positive | None = None
-    late_s: Positive = 1.0
+    late_s: Positive = 0.5
 
     @field_validator("registers")
     @classmethod

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -216,6 +217,17 @@ class TestImages:
             assert shot_of(frame, usb).begin_ns >= asked_ns
             assert "1 too late" in status(camera)
 
+    def test_that_got_lost_are_triggered_again_and_counted(self, rig):
+        usb, camera = rig({**SMALL, "late_s": 0.2})
+        with camera:
+            usb.camera.faults.mute = True
+            threading.Timer(0.3, setattr, (usb.camera.faults, "mute", False)).start()
+            asked_ns = now_ns()
+            frame = camera.grab(asked_ns, 30.0)
+            assert shot_of(frame, usb).begin_ns >= asked_ns
+            assert times_hold(frame, usb)
+            assert re.search(r"[1-9] missing", status(camera))
+
     def test_that_nobody_asked_for_are_not_taken(self, rig):
         usb, camera = rig()
         with camera:
@@ -240,6 +252,15 @@ class TestTimes:
                 frame = camera.grab(asked_ns + 5_000_000, WAIT_S)
                 assert times_hold(frame, usb)
                 assert shot_of(frame, usb).begin_ns >= asked_ns + 5_000_000
+
+    def test_of_a_camera_that_takes_long_hold(self, rig):
+        usb, camera = rig()
+        with camera:
+            usb.camera.faults.delay_s = 1.5  # longer than late_s, and it is not ready meanwhile
+            frame = camera.grab(now_ns(), 30.0)
+            assert times_hold(frame, usb)
+            usb.camera.faults.delay_s = 0.0
+            assert times_hold(camera.grab(now_ns(), WAIT_S), usb)
 
     def test_of_a_free_running_camera_hold_and_nothing_is_older_than_asked(self, rig):
         usb, camera = rig({**SMALL, "trigger": "free", "frame_rate_hz": 30.0, "readout_max_s": 0.3})

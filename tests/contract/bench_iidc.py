@@ -97,10 +97,15 @@ class Gadget:
         self._process = subprocess.Popen([sys.executable, str(_VM), str(self._path)])
         atexit.register(self._end)
         deadline = time.monotonic() + 60
-        while not self._path.exists():
+        while True:
             assert self._process.poll() is None, "the gadget's process ended; see its output"
             assert time.monotonic() < deadline, "the gadget was not there in 60 s"
-            time.sleep(0.1)
+            try:
+                self.ask(do="shots")
+            except (FileNotFoundError, ConnectionRefusedError):  # not yet
+                time.sleep(0.1)
+            else:
+                break
 
     def ask(self, **command: Any) -> dict[str, Any]:
         with socket.socket(socket.AF_UNIX) as connection:
@@ -153,7 +158,7 @@ def on_usb(_: Path) -> Iterator[Bench]:
     device.unplug()
     device.plug()
     # In this process: under emulation another one takes 10 s to start; guest_iidc.py does it once.
-    camera = in_process(name="colour", clock=SystemClock(), options=OPTIONS, shared={})
+    camera = in_process(name="colour", clock=SystemClock(), options={**OPTIONS, "late_s": 2.0}, shared={})
     yield bench(camera, 1.5, device.plug, device.unplug, device.faults)
     camera.close()
 

@@ -90,7 +90,12 @@ class FireflyGadget:
 
     def _serve(self) -> None:
         while True:
-            events = os.read(self._control, 4 * _EVENT.size)
+            try:
+                events = os.read(self._control, 4 * _EVENT.size)
+            except OSError as error:
+                if error.errno != errno.EIDRM:  # the host gave a request up before it was answered
+                    raise
+                continue
             for kind, request, value, index, length, event in _EVENT.iter_unpack(events):
                 if event in (ENABLE, DISABLE, UNBIND):
                     self._enabled = event == ENABLE
@@ -141,6 +146,7 @@ def obey(gadget: FireflyGadget, command: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     path = Path(sys.argv[1])
+    os.nice(-10)  # a camera's own processor answers whatever the computer does
     gadget = FireflyGadget()
     gadget.plug()
 
