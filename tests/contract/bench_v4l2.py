@@ -35,7 +35,7 @@ def cell_image() -> bytes:
 @contextmanager
 def on_vivid(_: Path) -> Iterator[Bench]:
     with Vivid(*_SIZE, fps=40) as vivid:
-        vivid.feed(cell_image(), "RGGB")
+        vivid.show(cell_image(), "RGGB")
         options = {"device_path": "/dev/video0", "width": 640, "height": 480, "pixel_format": "RGGB"}
         clock = SystemClock()
         colour = create("colour", "v4l2", clock=clock, options={**options, "gain": 40})

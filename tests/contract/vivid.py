@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import subprocess
-import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -37,7 +37,9 @@ def ctl(node: Path, *arguments: str) -> str:
 
 
 class Vivid:
-    """Both nodes of one vivid at one size, with an output that is fed until it is closed.
+    """Both nodes of one vivid at one size.
+
+    Its output keeps the last buffer that it was given, and the capture node shows that.
 
     Args:
         width: Pixels.
@@ -47,8 +49,8 @@ class Vivid:
 
     def __init__(self, width: int, height: int, fps: int) -> None:
         self.size, self._fps = (width, height), fps
-        self._stop, self._thread = threading.Event(), None
-        self._fed: tuple[bytes, str] | None = None
+        self._shown: tuple[bytes, str] | None = None
+        self._open = ExitStack()
         self.plug()
 
     @property
@@ -63,36 +65,43 @@ class Vivid:
         """Sets controls of the capture node."""
         ctl(self.capture, "-c", ",".join(f"{name}={value}" for name, value in controls.items()))
 
-    def feed(self, image: bytes, pixel_format: str) -> None:
+    def show(self, image: bytes, pixel_format: str) -> None:
         """Lets the capture node show an image of that format from now on, and after plug(), too."""
-        self._stop_feeding()
-        self._fed = image, pixel_format
-        started = threading.Event()
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._write, args=(image, pixel_format, started), daemon=True)
-        self._thread.start()
-        assert started.wait(20), "the output node took no frame"
+        from linuxpy.video.device import Device, VideoOutput
+
+        self._open.close()
+        self._shown = image, pixel_format
+        device = self._open.enter_context(Device(str(self.output)))
+        output = VideoOutput(device, size=2)
+        output.set_format(*self.size, pixel_format)
+        told = output.get_format()
+        assert (told.width, told.height, told.size) == (*self.size, len(image)), told
+        self._open.enter_context(output)
+        for _ in range(3):  # once for each buffer, which were queued empty, and one to push them out
+            output.write(image)
 
     def unplug(self) -> None:
         """Takes the camera off its bus."""
-        self._stop_feeding()
+        self._open.close()
         if (_DRIVER / "vivid.0").exists():
             (_DRIVER / "unbind").write_text("vivid.0")
         until(lambda: not self._nodes(), "the end of its nodes")
 
     def plug(self) -> None:
-        """Puts it there, if it is not; everything is as new, but for the image that is fed."""
+        """Puts it there, if it is not, with its controls as in the beginning and the image that it showed."""
+        self._open.close()
         if not (_DRIVER / "vivid.0").exists():
             (_DRIVER / "bind").write_text("vivid.0")
         until(lambda: len(self._nodes()) == 2, "its nodes")
         subprocess.run(["udevadm", "settle", "--timeout=20"], check=True, timeout=30)
-        self.set(percentage_of_dropped_buffers=0)  # which holds for the output, too: it would wait for ever
+        # Dropping holds for the output, too, which would then wait for ever.
+        self.set(percentage_of_dropped_buffers=0)
         timings = "cvt,width={},height={},fps={}".format(*self.size, self._fps)
         for node in (self.capture, self.output):
             ctl(node, f"--set-dv-bt-timings={timings}")
-        self.set(loop_video=1, osd_text_mode=2, gain_automatic=1)
-        if self._fed is not None:
-            self.feed(*self._fed)
+        self.set(loop_video=1, osd_text_mode=2, timestamp_source=0, contrast=128, gain_automatic=1)
+        if self._shown is not None:
+            self.show(*self._shown)
 
     def __enter__(self) -> Self:
         return self
@@ -100,9 +109,7 @@ class Vivid:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._nodes():
-            self.set(percentage_of_dropped_buffers=0)  # the output drops its buffers, too, and would wait
-        self._stop_feeding()
+        self._open.close()
 
     def _nodes(self) -> list[tuple[str, Path]]:
         names = [(each, each / "name") for each in _CLASS.glob("video*")] if _CLASS.exists() else []
@@ -111,26 +118,3 @@ class Vivid:
 
     def _node(self, kind: str) -> Path:
         return next(node for name, node in self._nodes() if kind in name)
-
-    def _write(self, image: bytes, pixel_format: str, started: threading.Event) -> None:
-        from linuxpy.video.device import Device, VideoOutput
-
-        with Device(str(self.output)) as device:
-            output = VideoOutput(device, size=4)
-            output.set_format(*self.size, pixel_format)
-            told = output.get_format()
-            assert (told.width, told.height, told.size) == (*self.size, len(image)), told
-            with output:
-                for count in range(1_000_000_000):
-                    if self._stop.is_set():
-                        return
-                    output.write(image)
-                    if count == 4:  # the first ones were taken: the loop shows the image
-                        started.set()
-
-    def _stop_feeding(self) -> None:
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(20)
-            assert not self._thread.is_alive(), "the output node is stuck"
-            self._thread = None

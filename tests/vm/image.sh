@@ -25,7 +25,7 @@ masked=(apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer e2scrub_all
 
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
-chmod 755 "$work"
+chmod 1777 "$work"  # without root, mmdebstrap's hooks are another user's
 
 kernel() {
   (cd "$work" && apt-get download -qq -o APT::Sandbox::User=root "$kernel_package")
@@ -84,21 +84,20 @@ disk() {
   [ -s "$work/sources.list" ] || { echo "image: apt knows no Debian mirror; run apt-get update" >&2; exit 69; }
   # mmdebstrap mounts /proc and others there while its hooks run; a plain bind mount leaves them out.
   populate='unshare --mount --propagation=private sh -ec "mount --bind \"$1\" /mnt
-    mke2fs -q -t ext4 -O ^has_journal -d /mnt \"$1.img\" 1400M" && mv "$1.img" "$1/disk.img"'
+    mke2fs -q -t ext4 -O ^has_journal -d /mnt '"$work"'/disk.img 900M"'
   tar -C "$work/overlay" --owner=0 --group=0 -cf "$work/overlay.tar" .
   local options=()
   while IFS= read -r option; do options+=(--aptopt="$option"); done < <(
     apt-config dump | grep -E '^Acquire::(https?::|Check-)[^"]* "[^"]+";' || true)
   mmdebstrap --quiet --variant=minbase --include="$debian" "${options[@]}" --format=null \
     --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/man/*' \
-    --dpkgopt='path-exclude=/usr/share/locale/*' \
+    --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt=force-unsafe-io \
     --customize-hook="tar-in '$work/overlay.tar' /" \
     --customize-hook="chroot \"\$1\" depmod $version" \
     --customize-hook='chroot "$1" /usr/bin/python3 -m venv --without-pip --system-site-packages /opt/surfclass' \
     --customize-hook='chroot "$1" /opt/surfclass/bin/python -c "import numpy, cv2, pydantic, pytest"' \
     --customize-hook='rm -rf "$1"/var/cache/apt/* "$1"/var/lib/apt/lists/*' \
     --customize-hook="$populate" \
-    --customize-hook="download /disk.img '$work/disk.img'" \
     "$suite" - "$work/sources.list" >/dev/null
   cp --sparse=always "$work/disk.img" "$directory/disk.img"
 }

@@ -14,7 +14,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-# What the tests in the virtual machine import; pip installs the project's own wheel there.
+# What the tests in the virtual machine import, but for the project itself.
 ROOTS = (
     "canopen",
     "cantools",
@@ -22,7 +22,6 @@ ROOTS = (
     "linuxpy",
     "numpy",
     "opencv-python-headless",
-    "pip",
     "pydantic",
     "pyserial",
     "pytest",
