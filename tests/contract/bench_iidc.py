@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -142,8 +142,11 @@ class Gadget:
 
 
 def _plugged() -> bool:
-    vendors = Path("/sys/bus/usb/devices").glob("*/idVendor")
-    return any(vendor.read_text().strip() == "1e10" for vendor in vendors)
+    for vendor in Path("/sys/bus/usb/devices").glob("*/idVendor"):
+        with suppress(OSError):  # it goes while it is read
+            if vendor.read_text().strip() == "1e10":
+                return True
+    return False
 
 
 @cache
