@@ -21,6 +21,16 @@ from drivers.sim.world import SimWorld
 from surfclass.errors import InputError
 
 _START_S = 180.0
+# Frames are rendered, not read out: they are few a second, late, and further apart than a camera's.
+_PATIENCE = """\
+[capture]
+max_skew_s = 1.0
+
+[limits]
+device_s = 6.0
+heartbeat_s = 60.0
+
+"""
 
 
 class Stage(Protocol):
@@ -101,7 +111,7 @@ class EmulatedStage:
         except BaseException:
             self._running.close()
             raise
-        self._tables = (folder / DEVICES).read_text()
+        self._tables = _PATIENCE + (folder / DEVICES).read_text()
         return self
 
     def __exit__(
@@ -116,6 +126,8 @@ class EmulatedStage:
 
     def board(self, scene: str, seed: int) -> tuple[SensorPackage, SimWorld]:
         """As `Stage.board`."""
+        if self._package is not None:
+            self._package.release("arm")  # whose reader does not believe that it can be elsewhere at once
         self._cell.show(scene, seed)
         if self._package is None:
             config = self._out / "boards.toml"
@@ -128,8 +140,7 @@ class EmulatedStage:
         """As `Stage.cell`."""
         self._let_go()
         self._cell.show("cell", self._seed)
-        # Frames are rendered, not read out: four a second, so colour and depth are further apart.
-        return f"[capture]\nmax_skew_s = 0.5\n\n{self._tables}"
+        return self._tables
 
     def _let_go(self) -> None:
         if self._package is not None:

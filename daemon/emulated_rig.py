@@ -212,9 +212,11 @@ latency_ms = {latency_ms:.1f}
 backend = "gardasoft"
 port_path = "{folder}/led"
 rating_a = 0.7
+reply_timeout_s = 1.0
 
 [arm]
 backend = "bcap"
 host = "127.0.0.1"
 port = {port}
+max_gap_s = 1.0  # a computer that renders and classifies on the same cores may be late
 """

@@ -29,7 +29,7 @@ from surfclass.frames import JointState
 from surfclass.schema import validate
 
 _CONNECT_TIMEOUT_S = 2.0
-_HISTORY_S = 2.0
+_HISTORY_S = 10.0  # longer than a capture can take from its colour frame on
 _STALE_S = 0.5  # without a reading for so long, an idle arm is not well
 _FAULTY_RUN = 5  # so many impossible readings in a row are no accident
 _RETRY_PAUSE_S = 0.02

@@ -31,7 +31,7 @@ from drivers.joint_history import JointHistory
 from surfclass.frames import JointState
 from surfclass.schema import validate
 
-_HISTORY_S = 2.0
+_HISTORY_S = 10.0  # longer than a capture can take from its colour frame on
 _SILENT_PERIODS = 10
 _SILENT_S = 0.2
 _JOIN_S = 2.0

@@ -117,7 +117,7 @@ class Arm(Device, Protocol):
     def joints_at(self, t_ns: int, timeout_s: float) -> JointState:
         """Returns the joint angles at `t_ns`, interpolated between the readings around it.
 
-        Waits for the reading after `t_ns` where that has not come yet. `t_ns` may lie a second back.
+        Waits for the reading after `t_ns` where that has not come yet. `t_ns` may lie ten seconds back.
 
         Raises:
             DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.

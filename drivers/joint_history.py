@@ -1,4 +1,4 @@
-"""The joint readings of the last second or two, written by a reader thread, asked by time from another."""
+"""The joint readings of the last seconds, written by a reader thread, asked by time from another."""
 
 from __future__ import annotations
 
