@@ -88,7 +88,9 @@ def eventually(condition, within_s=PATIENT_S):
 
 
 both_models = pytest.mark.parametrize("controller", [{"model": "RC8"}, {"model": "RC7"}], indirect=True)
-every_transport = pytest.mark.parametrize("transport", ["tcp", "udp", "serial"])
+every_transport = pytest.mark.parametrize(
+    "transport", ["tcp", "udp", pytest.param("serial", marks=pytest.mark.slow)]
+)
 
 
 @both_models
@@ -157,7 +159,8 @@ def test_lost_and_doubled_packets_cost_time_and_nothing_else(controller, transpo
         for _ in range(15):
             assert device.read_joints(PATIENT_S).q == pytest.approx(REST)
         assert "repeated calls" in status(device)
-        assert "late replies" in status(device)
+        if transport == "udp":  # on a line what is left over is dropped before the next call
+            assert "late replies" in status(device)
 
 
 @every_transport

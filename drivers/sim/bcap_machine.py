@@ -40,7 +40,7 @@ class BcapFaults:
             have 4 GiB; or what happens to the connection: it is closed, or reset.
         lose_requests: Each so-many-th request on UDP and RS-232 is lost on the way; 0: none.
         lose_replies: The same for replies.
-        duplicate: Each reply on UDP comes twice.
+        duplicate: Each reply on UDP and RS-232 comes twice.
         frozen: The controller's clock and joint values stand still.
         jump_ms: Added to the controller's clock.
         degrees: What is read instead of the joints' angles.
