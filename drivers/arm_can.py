@@ -28,6 +28,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Clock
 from drivers.joint_history import JointHistory
+from drivers.joint_limits import JointLimits
 from surfclass.frames import JointState
 from surfclass.schema import validate
 
@@ -35,12 +36,13 @@ _HISTORY_S = 10.0  # longer than a capture can take from its colour frame on
 _SILENT_PERIODS = 10
 _SILENT_S = 0.2
 _JOIN_S = 2.0
+_FAULTY_RUN = 5  # so many impossible sets in a row are no accident
 
 
 class CanArm:
     """An `Arm` whose angles come over CAN.
 
-    A thread reads the bus, and keeps the sets of the last two seconds. A set's time is that of its
+    A thread reads the bus, and keeps the sets of the last ten seconds. A set's time is that of its
     SYNC, or the middle between its first and its last frame, less the latency.
 
     Args:
@@ -62,10 +64,12 @@ class CanArm:
             max_gap_s=options.max_gap_s,
         )
         self._silent_ns = round(max(_SILENT_S, _SILENT_PERIODS * period_s) * 1e9)
+        self._limits = JointLimits(options.limits_deg, options.limit_margin_deg, options.max_speed_deg_s)
         self._bus: CanBus | None = None
         self._reader: threading.Thread | None = None
         self._stop = threading.Event()
         self._lock = threading.Lock()
+        self._faulty_run = 0
         self._faulty = self._gone = self._open = False
 
     @property
@@ -85,6 +89,8 @@ class CanArm:
         if self._open:
             return
         self._history.clear()
+        self._limits.forget()
+        self._faulty_run = 0
         self._faulty = self._gone = False
         self._stop = threading.Event()  # its own for each reader: one that hangs must not come back to life
         before = replace(self._source.counts)
@@ -125,7 +131,7 @@ class CanArm:
 
         Raises:
             DeviceLostError: If it went away, or is bus-off.
-            DeviceFaultError: If the last frames were impossible.
+            DeviceFaultError: If what came last was impossible, or a node reports a fault.
             DeviceTimeoutError: If no set came for ten periods.
         """
         bus = self._must_be_open()
@@ -184,6 +190,10 @@ class CanArm:
             np.array(joints.angles),
         )
         with self._lock:
+            if complaint := self._limits.complaint(state):
+                self._pass_over(complaint)
+                return
+            self._faulty_run = 0
             if self._gone:
                 return
             if self._faulty:
@@ -192,11 +202,14 @@ class CanArm:
             self._history.add(state)
 
     def impossible(self, reason: str) -> None:
+        """Passes over what is no angle; five in a row, without a good set in between, are a fault."""
+        with self._lock:
+            self._pass_over(reason)
+
+    def failed(self, reason: str) -> None:
         """Answers every question with the fault, until a good set comes."""
         with self._lock:
-            if not self._gone and not self._faulty:
-                self._faulty = True
-                self._history.end(DeviceFaultError, reason)
+            self._fail(reason)
 
     def lost(self, reason: str) -> None:
         """Answers every question with the loss, until it is opened again."""
@@ -227,6 +240,17 @@ class CanArm:
         finally:
             if not stop.is_set():
                 self.lost(reason)
+
+    def _pass_over(self, reason: str) -> None:
+        self._source.counts.impossible += 1
+        self._faulty_run += 1
+        if self._faulty_run >= _FAULTY_RUN:
+            self._fail(f"impossible joints {_FAULTY_RUN} times in a row: {reason}")
+
+    def _fail(self, reason: str) -> None:
+        if not self._gone and not self._faulty:
+            self._faulty = True
+            self._history.end(DeviceFaultError, reason)
 
     def _asked(self, ask: Callable[[int, float], JointState], t_ns: int, timeout_s: float) -> JointState:
         bus = self._must_be_open()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from drivers.can_bus import CanBus, CanFrame
-from drivers.can_joints import CountedSets, ImpossibleAngleError, JointSet, SetCounts, SyncedSets
-from drivers.can_layout import DbcOptions, Layout
+from drivers.can_joints import CountedSets, JointSet, SetCounts, SyncedSets
+from drivers.can_layout import DbcOptions, ImpossibleAngleError, Layout
 from drivers.can_source import JointListener
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from math import degrees, radians
 
 from drivers.can_stamps import Span
 
@@ -12,35 +11,6 @@ JOINTS = ("j1", "j2", "j3", "j4", "j5", "j6")
 _ALL = frozenset(range(len(JOINTS)))
 _MEMORY_PERIODS = 10
 _OPEN_SETS = 8
-
-
-class ImpossibleAngleError(ValueError):
-    """What came says that a joint has no angle, or one that it cannot have."""
-
-
-class JointLimits:
-    """The angles that the joints can have.
-
-    Args:
-        limits_deg: Lowest and highest of j1 to j6.
-    """
-
-    def __init__(self, limits_deg: Sequence[tuple[float, float]]) -> None:
-        self._limits = [(radians(low), radians(high)) for low, high in limits_deg]
-
-    def checked(self, joint: int, angle: float, said: str) -> float:
-        """Returns the angle, rad, of joint 0…5.
-
-        Raises:
-            ImpossibleAngleError: If it lies outside the limits, or is no number; it tells what was `said`.
-        """
-        low, high = self._limits[joint]
-        if not low <= angle <= high:
-            raise ImpossibleAngleError(
-                f"{JOINTS[joint]}: {said}, which is {degrees(angle):.2f}°; possible are "
-                f"{degrees(low):g}° to {degrees(high):g}°"
-            )
-        return angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +40,7 @@ class SetCounts:
         old: Frames with a counter that lies behind the last set's.
         unsynchronised: Frames before the first SYNC.
         malformed: Frames of a known id with the wrong length or an unknown selector.
+        impossible: Sets, or frames, with angles that no joint can have.
     """
 
     complete: int = 0
@@ -81,6 +52,7 @@ class SetCounts:
     old: int = 0
     unsynchronised: int = 0
     malformed: int = 0
+    impossible: int = 0
 
     def since(self, before: SetCounts) -> SetCounts:
         """Returns what was counted since a copy `before` was made."""

@@ -6,13 +6,13 @@ import difflib
 import importlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import pi
+from math import isfinite, pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, Strict, model_validator
 
-from drivers.can_joints import JOINTS, ImpossibleAngleError, JointLimits
+from drivers.can_joints import JOINTS
 from drivers.can_options import ReaderOptions
 from drivers.errors import DriverUnavailableError
 from surfclass.errors import ConfigurationError
@@ -98,6 +98,10 @@ class JointFrame:
     counter: int
 
 
+class ImpossibleAngleError(ValueError):
+    """What came says that a joint has no angle."""
+
+
 class Layout:
     """The frames of six joints.
 
@@ -118,7 +122,6 @@ class Layout:
 
     def __init__(self, device: str, options: DbcOptions) -> None:
         self._where = f"{device}: {options.dbc_path}"
-        self._limits = JointLimits(options.limits_deg)
         database = self._load(device, options.dbc_path)
         self._by_id: dict[tuple[int, bool], tuple[Message, list[tuple[int, JointSignal, float]]]] = {}
         signals = [getattr(options.joints, joint) for joint in JOINTS]
@@ -172,10 +175,10 @@ class Layout:
         return JointFrame(angles, counter)
 
     def _angle(self, joint: int, entry: JointSignal, scale: float, value: object) -> float:
-        said = f"{entry.message}.{entry.signal} says "
-        if not isinstance(value, int | float):  # the DBC has a name for this value
-            raise ImpossibleAngleError(f"{JOINTS[joint]}: {said}{str(value)!r}")
-        return self._limits.checked(joint, scale * value + entry.offset_rad, f"{said}{value:g}")
+        # A value that the DBC has a name for is no number, and neither is NaN.
+        if not isinstance(value, int | float) or not isfinite(value):
+            raise ImpossibleAngleError(f"{JOINTS[joint]}: {entry.message}.{entry.signal} says {str(value)!r}")
+        return scale * value + entry.offset_rad
 
     def _load(self, device: str, path: Path) -> Database:
         try:

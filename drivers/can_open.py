@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from drivers.can_bus import CanBus, CanFrame
-from drivers.can_joints import JOINTS, ImpossibleAngleError, JointLimits, JointSet, SetCounts, SyncedSets
+from drivers.can_joints import JOINTS, JointSet, SetCounts, SyncedSets
 from drivers.can_nodes import CanopenOptions, JointNode
 from drivers.can_source import JointListener
 from drivers.can_stamps import Span
@@ -77,7 +77,6 @@ class CanopenJoints:
         self.counts = SetCounts()
         self._device, self._options = device, options
         self._canopen = _canopen(device)
-        self._limits = JointLimits(options.limits_deg)
         self._joints: list[JointNode] = [getattr(options.nodes, joint) for joint in JOINTS]
         ids = {joint.node_id for joint in self._joints}
         self._services = {base + node: size for base, size in _SERVICES.items() for node in ids}
@@ -240,20 +239,11 @@ class CanopenJoints:
         if len(frame.data) != pdo.length:
             self.counts.malformed += 1
             return
-        try:
-            angles = {joint: self._angle(joint, frame.data[at : at + 4]) for joint, at in pdo.parts}
-        except ImpossibleAngleError as error:
-            self._listener.impossible(str(error))
-            return
+        angles = {joint: self._joints[joint].angle(frame.data[at : at + 4]) for joint, at in pdo.parts}
         with self._lock:
             joints = self._sets.add(angles, frame.span)
         if joints is not None:
             self._heard(joints)
-
-    def _angle(self, joint: int, data: bytes) -> float:
-        node = self._joints[joint]
-        said = f"0x{node.object:X} of node {node.node_id} says {int.from_bytes(data, 'little')}"
-        return self._limits.checked(joint, node.angle(data), said)
 
     def _heard(self, joints: JointSet) -> None:
         """Passes a set on, unless a node has said that something is wrong and not yet that it is over."""
@@ -284,19 +274,17 @@ class CanopenJoints:
         begin_ns = time.monotonic_ns()
         angles = []
         try:
-            for joint, node in enumerate(self._joints):
+            for node in self._joints:
                 if self._stop.is_set():
                     return
-                angles.append(self._angle(joint, self._read(node.node_id, node.object)))
-        except ImpossibleAngleError as error:
-            self._listener.impossible(str(error))
+                angles.append(node.angle(self._read(node.node_id, node.object)))
         except DeviceNotFoundError:
             self.counts.incomplete += 1
             self._stop.wait(
                 self._options.sdo_timeout_s
             )  # an answer that comes late must not be the next one's
         except DeviceFaultError as error:
-            self._listener.impossible(str(error).removeprefix(f"{self._device}: "))
+            self._listener.failed(str(error).removeprefix(f"{self._device}: "))
         else:
             span = Span(begin_ns, time.monotonic_ns())
             if span.end_ns - span.begin_ns > self._options.window_ms * 1e6:
@@ -333,7 +321,7 @@ class CanopenJoints:
             self._emergencies.pop(node, None)
         else:
             self._emergencies[node] = f"node {node} reports an emergency: {error}"
-            self._listener.impossible(self._emergencies[node])
+            self._listener.failed(self._emergencies[node])
 
     def _on_heartbeat(self, node: int, state: int) -> None:
         if state == _BOOTED and self._options.start_nodes:

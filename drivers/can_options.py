@@ -8,11 +8,11 @@ from typing import Annotated
 from pydantic import Field, Strict, field_validator, model_validator
 
 from drivers.can_bus import interfaces
+from drivers.joint_limits import VM_6083_DEG
 from surfclass.schema import Number, Positive, Table
 
 _OURS = {"interface", "channel", "bitrate", "receive_own_messages", "can_filters", "listen_only"}
 _NOT_BELOW_0 = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
-_TURN = (-360.0, 360.0)
 
 Range = tuple[Number, Number]
 
@@ -79,7 +79,9 @@ class ReaderOptions(BusOptions):
         latency_sd_ms: How far that can be off.
         max_gap_s: Angles are interpolated between sets no further apart than this.
         open_timeout_s: How long open() waits for the first set.
-        limits_deg: Lowest and highest angle of j1 to j6; what lies outside is a fault.
+        limits_deg: Least and greatest angle of j1 to j6; of the VM-6083 by default.
+        limit_margin_deg: How far beyond them an arm may still be.
+        max_speed_deg_s: Faster than this no joint turns.
     """
 
     period_ms: Annotated[Positive, Field(ge=1, le=1000)]
@@ -88,7 +90,9 @@ class ReaderOptions(BusOptions):
     latency_sd_ms: _NOT_BELOW_0 = 0.0
     max_gap_s: Annotated[Positive, Field(le=2)] = 0.1
     open_timeout_s: Positive = 2.0
-    limits_deg: tuple[Range, Range, Range, Range, Range, Range] = (_TURN,) * 6
+    limits_deg: tuple[Range, Range, Range, Range, Range, Range] = VM_6083_DEG
+    limit_margin_deg: Annotated[float, Strict(), Field(ge=0, le=30, allow_inf_nan=False)] = 3.0
+    max_speed_deg_s: Annotated[float, Strict(), Field(gt=0, le=3600, allow_inf_nan=False)] = 720.0
 
     @model_validator(mode="after")
     def _sets_are_neighbours(self) -> ReaderOptions:

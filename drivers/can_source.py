@@ -16,7 +16,10 @@ class JointListener(Protocol):
         """Six angles of one moment came."""
 
     def impossible(self, reason: str) -> None:
-        """What came cannot be an arm's angles, or a device reports a fault."""
+        """What came cannot be an arm's angles."""
+
+    def failed(self, reason: str) -> None:
+        """A device on the bus reports a fault."""
 
     def lost(self, reason: str) -> None:
         """The bus takes nothing any more."""

@@ -12,7 +12,8 @@ import pytest
 
 import drivers.can_bus
 from drivers.backends import create
-from drivers.can_stamps import Arrivals
+from drivers.can_joints import JointSet
+from drivers.can_stamps import Arrivals, Span
 from drivers.clock import SystemClock
 from drivers.errors import (
     DeviceFaultError,
@@ -112,22 +113,42 @@ def test_impossible_angles_are_a_fault_until_possible_ones_come(tmp_path):
     with can_site.bridge_on_a_bus(tmp_path) as (bridge, _):
         options = can_site.bridge_options("virtual", tmp_path)
         with can_site.reader(options) as arm:
+            seen = arm.read_joints(can_site.PATIENT_S)
             bridge.faults = {"impossible"}
-            assert "j2: Joints12.J2 says 400, which is 400.00°" in str(can_site.fails(arm))
+            assert "joint 2 at 400°, allowed are -93° to 138°" in str(can_site.fails(arm))
             with pytest.raises(DeviceFaultError):
                 arm.check()
             with pytest.raises(DeviceFaultError):
                 arm.joints_at(time.monotonic_ns(), 0.3)
-            bridge.faults = {"unavailable"}
-            can_site.waits_for(lambda: "faulty" not in str(can_site.fails(arm)))
-            recovered_ns = time.monotonic_ns()
             bridge.faults = set()
             can_site.waits_for(lambda: not failing(arm))
             with pytest.raises(DeviceTimeoutError, match="before the oldest"):
-                arm.joints_at(recovered_ns - 200_000_000, 0.3)
+                arm.joints_at(seen.t_ns, 0.3)
         bridge.faults = {"unavailable"}
         with pytest.raises(DeviceFaultError, match=r"j5: Joints56\.J5 says 'NotAvailable'"):
             can_site.reader(options).open()
+
+
+def test_a_single_impossible_set_is_passed_over(tmp_path):
+    sets = iter([0.5, 0.51, 3.5, 0.52, 0.9, 0.53])  # beyond its limits, then faster than it can turn
+    arm = can_site.reader(can_site.bridge_options("virtual", tmp_path))
+    start_ns = time.monotonic_ns() - 60_000_000
+    for number, angle in enumerate(sets):
+        span = Span(start_ns + number * 10_000_000, start_ns + number * 10_000_000 + 1000)
+        arm.heard(JointSet(span, (angle,) * 6))
+    kept = [arm._history._ring[index].q[0] for index in range(len(arm._history._ring))]
+    assert kept == [0.5, 0.51, 0.52, 0.53]
+
+
+def test_a_loss_is_told_after_a_fault_too(tmp_path):
+    with (
+        can_site.bridge_by_slcan(tmp_path / "can") as (bridge, adapter),
+        can_site.reader(can_site.bridge_options("slcan", tmp_path / "can")) as arm,
+    ):
+        bridge.faults = {"impossible"}
+        assert isinstance(can_site.fails(arm), DeviceFaultError)
+        adapter.stop()
+        can_site.waits_for(lambda: isinstance(can_site.outcome(arm), DeviceLostError))
 
 
 def failing(arm):
