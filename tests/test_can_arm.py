@@ -6,6 +6,8 @@ import time
 from types import SimpleNamespace
 
 import can
+import can.interfaces.slcan
+import can.interfaces.virtual
 import can_site
 import numpy as np
 import pytest
