@@ -1,8 +1,8 @@
 """Compares a set of joint angles from a CAN bus with the bare frames through python-can's recv().
 
-First the cost: the same frames, waiting in a virtual bus, are read by both as fast as they can (processor time). Then
-readers in a thread at 100 sets a second: their thread's processor time, and how long after a set's last
-frame was sent its joint state (or that frame) is in the hands of who waits for it.
+First the cost in processor time: the same frames, waiting in a virtual bus, are read by both as fast as
+they can. Then readers in a thread at 100 sets a second: their thread's processor time, and how long after
+a set's last frame was sent its joint state (or that frame) is in the hands of who waits for it.
 """
 
 from __future__ import annotations
