@@ -29,6 +29,9 @@ def cell(
     viewpoints: Annotated[
         int | None, typer.Option(min=1, help="How many places the arm visits; all by default.")
     ] = None,
+    told: Annotated[
+        bool, typer.Option("--told", help="The arm leaves a place only when a client says that it may.")
+    ] = False,
     restart_s: Annotated[
         float, typer.Option("--restart-s", min=0, help="An emulator that was killed comes back after this.")
     ] = 3.0,
@@ -36,7 +39,7 @@ def cell(
     """Run a simulated cell with all its devices: depth and colour camera, light and arm."""
     from daemon.emulated_rig import run_cell
 
-    raise typer.Exit(run_cell(folder, scene, seed, scale, viewpoints, restart_s))
+    raise typer.Exit(run_cell(folder, scene, seed, scale, viewpoints, told, restart_s))
 
 
 @sim.command()

@@ -13,12 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zenoh
 from numpy.typing import NDArray
 
 from daemon import maps, offline, pictures
+from daemon.console import MapClient
 from daemon.demo_stages import EmulatedStage, SimulatedStage, Stage
 from daemon.offline import console
 from daemon.processes import STOP_S, last_words, process
+from daemon.transport import TransportError, open_session
 from drivers.files import write_atomically
 from drivers.recording import Recording, RecordingWriter
 from drivers.sim import truth
@@ -66,7 +69,7 @@ def run_demo(out: Path, seed: int, viewpoints: int, real_drivers: bool = False) 
         offline.train_model(out / "train.mcap", out / "model.npz", TrainingSettings())
 
         console.rule(f"3  map the cell from {viewpoints} viewpoints: service and console in two processes")
-        recorded, stage_ms = _map_cell(out, world, viewpoints, devices)
+        recorded, stage_ms = _map_cell(out, viewpoints, devices, stage)
 
     console.rule("4  score the map against the simulation's truth")
     _label(recorded, out / "test.mcap", world)
@@ -118,7 +121,7 @@ def _truth_label(world: SimWorld, capture: Capture) -> NDArray[np.uint8]:
     return truth.label_image(world, capture.joints.q)
 
 
-def _map_cell(out: Path, world: SimWorld, viewpoints: int, devices: str) -> tuple[Path, dict[str, float]]:
+def _map_cell(out: Path, viewpoints: int, devices: str, stage: Stage) -> tuple[Path, dict[str, float]]:
     """Runs service and console until the console's map holds every viewpoint.
 
     Returns:
@@ -136,7 +139,7 @@ def _map_cell(out: Path, world: SimWorld, viewpoints: int, devices: str) -> tupl
             process(out / "console.log", watch) as watcher,
             console.status("the arm visits the cell"),
         ):
-            _wait(watcher, service, out, world)
+            _wait(watcher, service, out, endpoint, stage)
             service.send_signal(signal.SIGTERM)
             service.wait(STOP_S)
     (recording,) = (out / "recordings").glob("*.mcap")
@@ -144,23 +147,40 @@ def _map_cell(out: Path, world: SimWorld, viewpoints: int, devices: str) -> tupl
 
 
 def _wait(
-    watcher: subprocess.Popen[bytes], service: subprocess.Popen[bytes], out: Path, world: SimWorld
+    watcher: subprocess.Popen[bytes],
+    service: subprocess.Popen[bytes],
+    out: Path,
+    endpoint: str,
+    stage: Stage,
 ) -> None:
-    """Returns when the console has its map; meanwhile the world's textures are made, for the scoring.
+    """Returns when the console has its map; meanwhile the stage hears how far the service is.
 
     Raises:
         InputError: If either process ends badly; the message ends with what it said last.
     """
-    surfaces = list(range(len(world.renderer.surfaces)))
-    while watcher.poll() is None:
-        if service.poll() is not None:
-            raise InputError(f"the service ended with {service.returncode}: {last_words(out / 'daemon.log')}")
-        if surfaces:
-            world.texture(surfaces.pop(0))
-        else:
-            time.sleep(0.2)
+    with _session(endpoint, service, out) as session, MapClient(session, "demo") as client:
+        while watcher.poll() is None:
+            _must_run(service, out)
+            if client.map is not None:
+                stage.captured(client.map.sequence)
+            time.sleep(0.1)
     if watcher.returncode != 0:
         raise InputError(f"the console ended with {watcher.returncode}: {last_words(out / 'console.log')}")
+
+
+def _session(endpoint: str, service: subprocess.Popen[bytes], out: Path) -> zenoh.Session:
+    """A session with the service as soon as it listens."""
+    while True:
+        try:
+            return open_session("client", connect=[endpoint])
+        except TransportError:
+            _must_run(service, out)
+            time.sleep(0.2)
+
+
+def _must_run(service: subprocess.Popen[bytes], out: Path) -> None:
+    if service.poll() is not None:
+        raise InputError(f"the service ended with {service.returncode}: {last_words(out / 'daemon.log')}")
 
 
 def _label(recorded: Path, out: Path, world: SimWorld) -> None:

@@ -45,6 +45,9 @@ class Stage(Protocol):
     def cell(self) -> str:
         """Puts up the cell, lets go of the devices, and returns their tables of a configuration."""
 
+    def captured(self, count: int) -> None:
+        """Tells how many viewpoints of the cell have been captured so far."""
+
 
 class SimulatedStage:
     """The simulated devices; each board is a world of its own, and the cell is the service's."""
@@ -70,6 +73,9 @@ class SimulatedStage:
         tables = [f'[{kind}]\nbackend = "sim"\n' for kind in ("colour", "depth", "light", "arm")]
         told = f'[sim]\nscene = "cell"\nseed = {self._seed}\nviewpoints = {self._viewpoints}\n'
         return "\n".join([*tables, told])
+
+    def captured(self, count: int) -> None:
+        """Changes nothing: this arm goes on when a lit exposure is over."""
 
     def __enter__(self) -> Self:
         return self
@@ -98,7 +104,7 @@ class EmulatedStage:
         folder = Path(self._running.enter_context(tempfile.TemporaryDirectory(prefix="surfclass-")))
         log = self._out / "devices.log"
         arguments = ["sim", "cell", "--dir", str(folder), "--seed", str(self._seed)]
-        arguments += ["--viewpoints", str(self._viewpoints)]
+        arguments += ["--viewpoints", str(self._viewpoints), "--told"]
         try:
             running = self._running.enter_context(process(log, arguments))
             until = time.monotonic() + _START_S
@@ -141,6 +147,10 @@ class EmulatedStage:
         self._let_go()
         self._cell.show("cell", self._seed)
         return self._tables
+
+    def captured(self, count: int) -> None:
+        """As `Stage.captured`: the arm waits for that, so a capture that was rejected is taken again."""
+        self._cell.go_on(count)
 
     def _let_go(self) -> None:
         if self._package is not None:

@@ -25,7 +25,7 @@ from surfclass.errors import InputError
 SOCKET, DEVICES, PIDS = "cell.sock", "devices.toml", "pids.json"
 CAMERA = "SIM01"
 # What two cores can render while the daemon has some of them left.
-KINECT_RATE_HZ = 5.0
+KINECT_RATE_HZ = 4.0
 KINECT_LATENCY_S = 0.2
 _READY_S = 60.0
 _STOP_S = 5.0
@@ -33,7 +33,13 @@ _LOOK_S = 0.1
 
 
 def run_cell(
-    folder: Path, scene: str, seed: int, scale: float, viewpoints: int | None, restart_s: float
+    folder: Path,
+    scene: str,
+    seed: int,
+    scale: float,
+    viewpoints: int | None,
+    told: bool,
+    restart_s: float,
 ) -> int:
     """Serves the cell and keeps its four devices running until SIGTERM or SIGINT.
 
@@ -46,7 +52,7 @@ def run_cell(
     """
 
     def make(scene: str, seed: int) -> WorldCell:
-        cell = host_cell(scene, seed, scale=scale, viewpoints=viewpoints)
+        cell = host_cell(scene, seed, scale=scale, viewpoints=viewpoints, told=told)
         cell.bake()
         return cell
 

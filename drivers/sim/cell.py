@@ -55,15 +55,16 @@ class Cell(Protocol):
 class WorldCell:
     """A simulated world as a `Cell`; may be used from several threads.
 
-    The arm's programme goes on when a capture is over: when the light goes off after a colour
-    exposure that it lit while the arm stood still.
-
     Args:
         world: On the host's clock.
+        told: When the arm's programme goes on. True: when `go_on` says so. False: when a capture seems to
+            be over, that is when the light goes off after an exposure that it lit while the arm stood
+            still; whether the capture was any good nobody here knows.
     """
 
-    def __init__(self, world: SimWorld) -> None:
+    def __init__(self, world: SimWorld, told: bool = False) -> None:
         self.world = world
+        self._told = told
         self._lock = threading.Lock()
         self._lit: tuple[int, float] | None = None  # when the last lit exposure began, and its level
         self._level = 0.0
@@ -90,7 +91,13 @@ class WorldCell:
             if level > 0 or self._lit is None:
                 return
             (began_ns, lit_level), self._lit = self._lit, None
-        self.world.exposed(began_ns, max(holds_from_ns, began_ns + 1), lit_level)
+        if not self._told:
+            self.world.exposed(began_ns, max(holds_from_ns, began_ns + 1), lit_level)
+
+    def go_on(self, captured: int) -> None:
+        """Tells that so many viewpoints were captured; the arm leaves if the one it is at is among them."""
+        if self.world.program_index < captured:
+            self.world.go_on()
 
     @property
     def light_is_on(self) -> bool:
@@ -126,9 +133,12 @@ class WorldCell:
             self.world.renderer.prepare(self.world.base_T_rgb(q))
 
     def bake(self) -> None:
-        """Makes all textures now, so that no exposure has to wait for one."""
+        """Makes all textures and looks once with each camera, so that no exposure has to wait for that."""
         for number in range(len(self.world.renderer.surfaces)):
             self.world.texture(number)
+        q = self.world.joints()
+        self.world.render_depth(q, 0)
+        self.world.render_colour(q, 1.0, 0)
 
     def _exposure(self, begin_ns: int, end_ns: int) -> tuple[Float64, float, float]:
         """Waits for the end; returns the joints at the middle, the light's level and the exposure time."""
@@ -141,7 +151,12 @@ class WorldCell:
 
 
 def host_cell(
-    scene: str = "cell", seed: int = 0, *, scale: float = 1.0, viewpoints: int | None = None
+    scene: str = "cell",
+    seed: int = 0,
+    *,
+    scale: float = 1.0,
+    viewpoints: int | None = None,
+    told: bool = False,
 ) -> WorldCell:
     """Returns a simulated world on the host's clock.
 
@@ -150,6 +165,7 @@ def host_cell(
         seed: Of textures and noise.
         scale: Of the images, 0.05…1.
         viewpoints: How many of the scene's the arm visits, evenly spread; None: all of them.
+        told: As for `WorldCell`.
 
     Raises:
         ConfigurationError: If the scene is unknown or a number outside its range.
@@ -162,4 +178,4 @@ def host_cell(
         program=scenes.spread(scene, viewpoints),
         dwell_s=_DWELL_S,
     )
-    return WorldCell(world)
+    return WorldCell(world, told)

@@ -28,7 +28,7 @@ _log = logging.getLogger("surfclass.sim.cell")
 _HEADER_BYTES = 65536
 _ARRAY_BYTES = 64 * 2**20
 _ANSWER_S = 60.0  # a frame of a scene whose textures are not made yet takes many seconds
-_CALLS = ("joints", "set_light", "light_level", "raw", "rgb", "depth")
+_CALLS = ("joints", "set_light", "light_level", "raw", "rgb", "depth", "go_on")
 
 
 class CellServer:
@@ -199,6 +199,10 @@ class CellClient:
     def show(self, scene: str, seed: int) -> None:
         """Puts another scene in front of the arm."""
         self._ask("show", scene, seed)
+
+    def go_on(self, captured: int) -> None:
+        """As `WorldCell.go_on`."""
+        self._ask("go_on", captured)
 
     @property
     def program_done(self) -> bool:

@@ -17,7 +17,7 @@ from surfclass.types import Float32, Transform
 
 
 class Renderer:
-    """Draws one scene; may be called from several threads, and then works for one at a time.
+    """Draws one scene; may be called from several threads, and then draws one image of each camera at a time.
 
     Args:
         surfaces: Of the scene, in `base`.
@@ -32,7 +32,8 @@ class Renderer:
         self.seed = seed
         self._texel_m = TEXEL_M / scale
         self._textures: dict[int, Texture] = {}
-        self._lock = threading.RLock()
+        # Apart, so that neither camera waits for the other's image.
+        self._texture_lock, self._colour_lock, self._depth_lock = (threading.Lock() for _ in range(3))
         self._last: tuple[bytes, Float32, Float32, Float32] | None = None
         self._last_depth: tuple[bytes, Hits, Float32, Float32] | None = None
 
@@ -43,14 +44,14 @@ class Renderer:
 
     def texture(self, number: int) -> Texture:
         """Returns the baked look of surface `number`; made when it is first seen."""
-        with self._lock:
+        with self._texture_lock:
             if number not in self._textures:
                 self._textures[number] = bake(self.surfaces[number], self.seed, self._texel_m)
             return self._textures[number]
 
     def irradiance(self, base_T_rgb: Transform, level: float, ambient: float, exposure_s: float) -> Float32:
         """Returns (h, w, 3) linear light on the sensor as a fraction of full scale, without noise."""
-        with self._lock:
+        with self._colour_lock:
             lit, albedo, z = self._radiance(base_T_rgb)
             light = np.float32(level) * lit + np.float32(ambient) * albedo
             image = colour_camera.defocus(self.package, light, z)
@@ -59,7 +60,7 @@ class Renderer:
 
     def prepare(self, base_T_rgb: Transform) -> None:
         """Does now what the next colour image from there would have to wait for."""
-        with self._lock:
+        with self._colour_lock:
             self._radiance(base_T_rgb)
 
     def colour(
@@ -96,14 +97,14 @@ class Renderer:
     def _infrared(self, base_T_depth: Transform) -> tuple[Hits, Float32, Float32]:
         """What the depth camera sees and how its projector lights it; kept for the next frame at rest."""
         key = base_T_depth.matrix.tobytes()
-        with self._lock:
+        with self._depth_lock:
             if self._last_depth is not None and self._last_depth[0] == key:
                 return self._last_depth[1:]
         hits = self.hits(base_T_depth)
         present = set(np.unique(hits.face).tolist())
         textures = [self.texture(n) if n in present else None for n in range(len(hits.faces))]
         light, cosine = depth_camera.infrared(self.package, hits, textures, self.seed)
-        with self._lock:
+        with self._depth_lock:
             self._last_depth = (key, hits, light, cosine)
         return hits, light, cosine
 

@@ -173,10 +173,18 @@ class SimWorld:
                 return  # the same stop, seen again before the arm has left it
             if self.fault("arm", "frozen", end_ns):
                 return
-            leave_ns = end_ns + round(self.dwell_s * 1e9)
-            self._seen.append(leave_ns)
+            self._leave(end_ns + round(self.dwell_s * 1e9))
+
+    def go_on(self) -> None:
+        """Lets the robot program go on now, whatever was exposed."""
+        with self._lock:
             if not self.program_done:
-                self._seen[-1] = self._motion.move_to(self.program[len(self._seen)].q, leave_ns)
+                self._leave(self.clock.now_ns())
+
+    def _leave(self, t_ns: int) -> None:
+        self._seen.append(t_ns)
+        if not self.program_done:
+            self._seen[-1] = self._motion.move_to(self.program[len(self._seen)].q, t_ns)
 
     def base_T_rgb(self, q: Float64) -> Transform:
         """The colour camera's pose."""

@@ -94,6 +94,21 @@ def test_the_programme_goes_on_when_the_capture_is_over():
     assert world.program_index == 1
 
 
+def test_an_arm_that_waits_to_be_told_leaves_when_it_was_captured():
+    cell = host_cell("cell", 1, scale=0.05, viewpoints=3, told=True)
+    begin = lit(cell)
+    cell.raw(begin, begin + MS, 0.0, 1)
+    cell.set_light(0.0, time.monotonic_ns())
+    cell.go_on(0)
+    assert cell.world.program_index == 0
+    cell.go_on(1)
+    cell.go_on(1)
+    assert cell.world.program_index == 1
+    cell.go_on(2)
+    cell.go_on(3)
+    assert cell.world.program_done
+
+
 def test_an_unlit_exposure_does_not_let_the_programme_go_on():
     cell = host_cell("cell", 1, scale=0.05, viewpoints=3)
     begin = time.monotonic_ns()
