@@ -14,7 +14,9 @@ from surfclass.rig import Camera, Light, Response, Rig
 from surfclass.types import Bool, Float32, Float64, SurfaceView, freeze
 
 UNDER_EXPOSED = 0.02
-"""Fraction of full scale at and below which a channel says nothing but noise."""
+"""Fraction of full scale at and below which a channel of 8 bits says nothing but noise."""
+LEAST_IRRADIANCE = 0.0015
+"""The same as g⁻¹(I), for images of more bits: what `UNDER_EXPOSED` is in the response of sRGB."""
 OVER_EXPOSED = 0.98
 """Fraction of full scale at and above which a channel is saturated."""
 LEAST_LIGHT_COSINE = 0.5
@@ -60,12 +62,28 @@ def fit_distance_polynomial(
     return float(a2), float(a1), float(a0)
 
 
-def well_exposed(fraction: Float32) -> Bool:
-    """Returns (h, w): no channel of the (3, h, w) fractions is under- or over-exposed."""
+def well_exposed(fraction: Float32, least: float = UNDER_EXPOSED) -> Bool:
+    """Returns (h, w): no channel of the (3, h, w) fractions is at or below `least`, or over-exposed."""
     low = np.minimum(np.minimum(fraction[0], fraction[1]), fraction[2])
     high = np.maximum(np.maximum(fraction[0], fraction[1]), fraction[2])
-    good: Bool = (low > UNDER_EXPOSED) & (high < OVER_EXPOSED)
+    good: Bool = (low > np.float32(least)) & (high < OVER_EXPOSED)
     return good
+
+
+def least_fraction(response: Response | None, bits: int) -> float:
+    """Returns the fraction of full scale at and below which a channel says nothing but noise.
+
+    Where a deep image has a known response, the limit is one of light: in a linear image a fraction of
+    0.02 is a surface that any camera sees well.
+
+    Args:
+        response: The camera's.
+        bits: Of the image, 8 or 16.
+    """
+    if bits <= 8 or response is None or response.inverse is None:
+        return UNDER_EXPOSED
+    levels = (np.interp(LEAST_IRRADIANCE, curve, np.linspace(0, 1, len(curve))) for curve in response.inverse)
+    return min(UNDER_EXPOSED, float(max(levels)))
 
 
 def diffuse_reflectance(
@@ -74,6 +92,7 @@ def diffuse_reflectance(
     rig: Rig,
     mode: Literal["thesis", "full"],
     exposure_ratio: float = 1.0,
+    bits: int = 8,
 ) -> tuple[Float32, Bool]:
     """Returns K_d of every pixel and channel.
 
@@ -87,6 +106,7 @@ def diffuse_reflectance(
         rig: Its light, response and vignetting.
         mode: Which of the two.
         exposure_ratio: Reference exposure time over this image's.
+        bits: Of the image that the fractions are of, 8 or 16.
 
     Returns:
         (3, h, w) float32, 0 where not valid; and (h, w) bool: False where there is no normal, where
@@ -101,7 +121,8 @@ def diffuse_reflectance(
     if rig.light is None or view.light_distance_m is None or view.light_cosine is None:
         raise _missing(rig, "light.position_rgb_m")
     d, cosine = view.light_distance_m, view.light_cosine
-    valid: Bool = view.has_normal & (cosine >= LEAST_LIGHT_COSINE) & well_exposed(fraction)
+    valid: Bool = view.has_normal & (cosine >= LEAST_LIGHT_COSINE)
+    valid &= well_exposed(fraction, least_fraction(rig.response, bits))
     if mode == "thesis":
         if abs(exposure_ratio - 1) > _SAME_EXPOSURE:
             raise InputError(

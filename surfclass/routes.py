@@ -47,7 +47,8 @@ def colour_features(
     """
     fraction = colour.as_fraction(image)
     if feature == "K_d":
-        return reflectance.diffuse_reflectance(fraction, view, rig, mode, exposure_ratio)
+        bits = 8 * image.dtype.itemsize
+        return reflectance.diffuse_reflectance(fraction, view, rig, mode, exposure_ratio, bits)
     everywhere = np.ones(image.shape[:2], bool)
     return (fraction if feature == "RGB" else colour.a_b(fraction)), everywhere
 

@@ -6,8 +6,11 @@ from raycast import Plane, make_rig, pixel_rays
 
 from surfclass.errors import InputError, MissingCalibrationError
 from surfclass.reflectance import (
+    LEAST_IRRADIANCE,
+    UNDER_EXPOSED,
     diffuse_reflectance,
     fit_distance_polynomial,
+    least_fraction,
     subtract_dark,
     well_exposed,
 )
@@ -243,6 +246,17 @@ def test_well_exposed_looks_at_every_channel():
     image = np.full((3, 1, 4), 0.5, np.float32)
     image[0, 0, 1], image[1, 0, 2], image[2, 0, 3] = 0.02, 0.98, 0.0
     assert well_exposed(image).tolist() == [[True, False, False, False]]
+
+
+def test_a_deep_linear_image_is_under_exposed_by_its_light_and_not_by_its_fraction():
+    linear = Response(inverse=((0.0, 1.0),) * 3)
+    level = np.linspace(0, 1, 256)
+    srgb = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    encoded = Response(inverse=(tuple(srgb.tolist()),) * 3)
+    assert least_fraction(linear, 16) == pytest.approx(LEAST_IRRADIANCE)
+    assert least_fraction(encoded, 16) == pytest.approx(UNDER_EXPOSED, abs=0.001)
+    for response, bits in ((linear, 8), (None, 16), (Response(a2_a1_a0=((1.0, 0.0, 0.0),) * 3), 16)):
+        assert least_fraction(response, bits) == UNDER_EXPOSED
 
 
 def test_polynomial_of_a_square_root_response_is_linear():
