@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm_bcap import arm
-from drivers.arm_bcap_options import ArmBcapOptions
-from drivers.arm_bcap_session import ArmSession
-from drivers.bcap import Function, Packet, encode
-from drivers.bcap_transport import SerialLink, TcpLink, UdpLink
-from drivers.bcap_variant import EMPTY, bstr, i4, r8_array
+from drivers.bcap.options import ArmBcapOptions
+from drivers.bcap.packet import Function, Packet, encode
+from drivers.bcap.session import ArmSession
+from drivers.bcap.transport import SerialLink, TcpLink, UdpLink
+from drivers.bcap.variant import EMPTY, bstr, i4, r8_array
 from drivers.clock import SystemClock
-from drivers.sim.bcap_controller import BcapController
+from drivers.emulators.bcap_controller import BcapController
 
 READS = 2000
 READER_S = 10.0

@@ -20,13 +20,13 @@ import can
 import numpy as np
 
 from drivers.arm_can import dbc
-from drivers.can_bus import CanBus
-from drivers.can_dbc import DbcJoints
-from drivers.can_layout import DbcOptions, Layout
-from drivers.can_options import BusOptions
+from drivers.canbus.bus import CanBus
+from drivers.canbus.dbc import DbcJoints
+from drivers.canbus.layout import DbcOptions, Layout
+from drivers.canbus.options import BusOptions
 from drivers.clock import SystemClock
-from drivers.sim.can_bridge import BusEnd, CanBridge, joint_frames
-from drivers.sim.slcan_adapter import SlcanAdapter
+from drivers.emulators.can_bridge import BusEnd, CanBridge, joint_frames
+from drivers.emulators.slcan_adapter import SlcanAdapter
 from surfclass.schema import validate
 
 DBC = Path(__file__).resolve().parents[1] / "systemd/can_joints.dbc"

@@ -23,7 +23,7 @@ import numpy as np
 from drivers.bayer import demosaic
 from drivers.clock import SystemClock
 from drivers.colour_aravis import colour, in_process
-from drivers.sim.gige_camera import GigeCamera
+from drivers.emulators.gige_camera import GigeCamera
 
 SIZE = (1280, 960)
 FRAMES = 60

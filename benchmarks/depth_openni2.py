@@ -23,9 +23,9 @@ import numpy as np
 
 from drivers import depth_openni2
 from drivers.clock import SystemClock
+from drivers.emulators.virtual_kinect import VirtualKinect
 from drivers.openni2 import api, plugins
 from drivers.openni2.build import build
-from drivers.sim.virtual_kinect import VirtualKinect
 
 WIDTH, HEIGHT, RATE_HZ = 640, 480, 30
 EXPOSURES, WARM_UP = 150, 15

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from drivers.interfaces import Clock
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 from surfclass.frames import ColourFrame, DepthFrame
 
 FRAMES = 300

@@ -25,7 +25,7 @@ from drivers.clock import SystemClock
 
 ROUNDS = 2000
 EMULATOR = (
-    "import sys; from drivers.sim.led_controller import LedController as C; c = C(None, sys.argv[1]);"
+    "import sys; from drivers.emulators.led_controller import LedController as C; c = C(None, sys.argv[1]);"
     "c.start(); print('here', flush=True); c.wait()"
 )
 COMMANDS = (b"RS1,100\r", b"RS1,0\r")

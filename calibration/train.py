@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from drivers.files import check_output, write_atomically
-from drivers.recording import Recording
+from drivers.recordings import Recording
 from surfclass.errors import InputError
 from surfclass.model import Model
 from surfclass.training import TrainingSettings, train

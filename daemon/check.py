@@ -11,7 +11,7 @@ from daemon import wiring
 from daemon.check_devices import check_devices
 from daemon.config import Config
 from daemon.findings import Finding, Notes
-from drivers.recording import Recording
+from drivers.recordings import Recording
 from surfclass.pipeline import Pipeline
 
 PACKAGES = ("surfclass", "drivers", "calibration", "daemon")

@@ -113,7 +113,7 @@ def recover(
 ) -> None:
     """Make a whole recording out of one that was cut off."""
     from daemon import offline
-    from drivers.recording import recover as recover_recording
+    from drivers.recordings import recover as recover_recording
 
     offline.console.print(f"{recover_recording(path)}")
 

@@ -23,7 +23,7 @@ from daemon.offline import console
 from daemon.processes import STOP_S, last_words, process
 from daemon.transport import TransportError, open_session
 from drivers.files import write_atomically
-from drivers.recording import Recording, RecordingWriter
+from drivers.recordings import Recording, RecordingWriter
 from drivers.sim import truth
 from drivers.sim.world import SimWorld
 from surfclass.errors import InputError

@@ -19,7 +19,7 @@ _LOOK_S = 0.5
 
 def run_led(cell_socket: Path | None, link: Path, tcp_port: int | None) -> int:
     """Runs an LED controller on a pseudo-terminal, and says what it is told."""
-    from drivers.sim.led_controller import LedController
+    from drivers.emulators.led_controller import LedController
 
     with _cell(cell_socket) as cell:
         led = LedController(
@@ -31,7 +31,7 @@ def run_led(cell_socket: Path | None, link: Path, tcp_port: int | None) -> int:
 
 def run_arm(cell_socket: Path | None, host: str, port: int, serial_link: Path | None, model: str) -> int:
     """Runs a robot controller that serves b-CAP."""
-    from drivers.sim.bcap_controller import BcapController
+    from drivers.emulators.bcap_controller import BcapController
 
     if model not in ("RC7", "RC8"):
         raise InputError(f"--model {model}: allowed are RC7 and RC8")
@@ -47,7 +47,7 @@ def run_arm(cell_socket: Path | None, host: str, port: int, serial_link: Path | 
 
 def run_kinect(cell_socket: Path | None, memory: Path, rate_hz: float, latency_s: float) -> int:
     """Runs a virtual Kinect, which OpenNI2 finds by its plug-in."""
-    from drivers.sim.virtual_kinect import VirtualKinect
+    from drivers.emulators.virtual_kinect import VirtualKinect
 
     with _cell(cell_socket, images=True) as cell:
         kinect = VirtualKinect(cell, memory, fps=rate_hz, latency_s=latency_s)
@@ -56,7 +56,7 @@ def run_kinect(cell_socket: Path | None, memory: Path, rate_hz: float, latency_s
 
 def run_camera(cell_socket: Path | None, serial: str, address: str) -> int:
     """Runs a GigE Vision camera."""
-    from drivers.sim.gige_camera import GigeCamera
+    from drivers.emulators.gige_camera import GigeCamera
 
     with _cell(cell_socket, images=True) as cell:
         return _run(cell, GigeCamera(cell, serial, address), f"GigE Vision camera {serial} at {address}")

@@ -24,7 +24,7 @@ from daemon.findings import Verdict, exit_code
 from daemon.offline import console, progress, write_json
 from daemon.transport import TransportError, open_session
 from drivers.files import check_output, read_file, write_atomically
-from drivers.recording import RecordingWriter, unix_offset_ns
+from drivers.recordings import RecordingWriter, unix_offset_ns
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.map_file import to_npz_bytes
 from surfclass.pooling import Pool

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from daemon import pictures
 from daemon.offline import console, load_map, load_model
 from drivers.files import check_output, read_file
-from drivers.recording import Recording
+from drivers.recordings import Recording
 from surfclass.errors import InputError
 from surfclass.map_file import MapFile
 from surfclass.pipeline import Pipeline, per_pixel

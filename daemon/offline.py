@@ -16,8 +16,8 @@ from rich.table import Table
 
 import calibration.train
 from drivers.files import check_output, read_file, write_atomically
-from drivers.folder import read_folder
-from drivers.recording import Recording, RecordingWriter
+from drivers.recordings import Recording, RecordingWriter
+from drivers.recordings.folder import read_folder
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.evaluation import ROUTES, SCHEMA, benchmark_of, evaluate, score_layers
 from surfclass.frames import MAP_ROLES

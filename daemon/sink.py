@@ -17,7 +17,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from daemon.config import Config
 from daemon.logs import log
 from drivers.files import read_file
-from drivers.recording import RecordingWriter, unix_offset_ns
+from drivers.recordings import RecordingWriter, unix_offset_ns
 from surfclass import map_pb2
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import Capture
@@ -27,7 +27,7 @@ _log = logging.getLogger("surfclass.recording")
 
 
 class Writer(Protocol):
-    """What `drivers.recording.RecordingWriter` provides."""
+    """What `drivers.recordings.RecordingWriter` provides."""
 
     def write(self, capture: Capture, encoded: Mapping[str, bytes] | None = None) -> None:
         """Keeps one capture."""

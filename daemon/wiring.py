@@ -36,8 +36,8 @@ from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.files import read_file
 from drivers.interfaces import Clock, Light
-from drivers.recording import Recording
-from drivers.replay import RecordingSource
+from drivers.recordings import Recording
+from drivers.recordings.replay import RecordingSource
 from drivers.sensor_package import SensorPackage, SensorSettings
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import MAP_ROLES

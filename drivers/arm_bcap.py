@@ -12,9 +12,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from drivers.arm_bcap_options import ArmBcapOptions
-from drivers.arm_bcap_session import ArmSession, Reading
-from drivers.bcap_transport import Link, SerialLink, TcpLink, UdpLink
+from drivers.bcap.options import ArmBcapOptions
+from drivers.bcap.session import ArmSession, Reading
+from drivers.bcap.transport import Link, SerialLink, TcpLink, UdpLink
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,

@@ -11,14 +11,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from drivers.can_bus import CanBus
-from drivers.can_dbc import DbcJoints
-from drivers.can_joints import JointSet, SetCounts
-from drivers.can_layout import DbcOptions, Layout
-from drivers.can_nodes import CanopenOptions
-from drivers.can_open import CanopenJoints
-from drivers.can_options import ReaderOptions
-from drivers.can_source import JointSource
+from drivers.canbus.bus import CanBus
+from drivers.canbus.dbc import DbcJoints
+from drivers.canbus.joints import JointSet, SetCounts
+from drivers.canbus.layout import DbcOptions, Layout
+from drivers.canbus.nodes import CanopenOptions
+from drivers.canbus.objects import CanopenJoints
+from drivers.canbus.options import ReaderOptions
+from drivers.canbus.source import JointSource
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,

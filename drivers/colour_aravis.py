@@ -14,11 +14,11 @@ from functools import partial
 from types import TracebackType
 from typing import Any, NoReturn, Self, TypeVar
 
-from drivers.aravis_control import ControlThread
-from drivers.aravis_library import Buffer, Camera, GenicamError
-from drivers.aravis_options import AravisOptions
-from drivers.aravis_session import Session, change_trigger, connect, restart
-from drivers.aravis_timing import Trigger
+from drivers.aravis.control import ControlThread
+from drivers.aravis.library import Buffer, Camera, GenicamError
+from drivers.aravis.options import AravisOptions
+from drivers.aravis.session import Session, change_trigger, connect, restart
+from drivers.aravis.timing import Trigger
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -26,7 +26,7 @@ from drivers.errors import (
     DeviceTimeoutError,
 )
 from drivers.interfaces import Clock, ColourCamera
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 from surfclass.errors import InputError
 from surfclass.frames import ColourFrame
 from surfclass.schema import validate

@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.bayer import demosaic
-from drivers.dc1394 import Camera, Dc1394Error, Library
-from drivers.dc1394_types import CAPTURE_FLAGS_DEFAULT, ISO_SPEED_400, LIBRARY, PACKAGE
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -29,12 +27,14 @@ from drivers.errors import (
     DeviceTimeoutError,
     DriverUnavailableError,
 )
-from drivers.iidc_features import Exposure, set_exposure, set_registers, set_strobe, set_trigger
-from drivers.iidc_format import Format, set_format
-from drivers.iidc_options import IidcOptions, SetupError
-from drivers.iidc_stream import Arrival, IidcStream, StreamEndedError
+from drivers.iidc.dc1394 import Camera, Dc1394Error, Library
+from drivers.iidc.dc1394_types import CAPTURE_FLAGS_DEFAULT, ISO_SPEED_400, LIBRARY, PACKAGE
+from drivers.iidc.features import Exposure, set_exposure, set_registers, set_strobe, set_trigger
+from drivers.iidc.image_format import Format, set_format
+from drivers.iidc.options import IidcOptions, SetupError
+from drivers.iidc.stream import Arrival, IidcStream, StreamEndedError
 from drivers.interfaces import Clock
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 from surfclass.errors import InputError
 from surfclass.frames import ColourFrame
 from surfclass.schema import validate

@@ -18,7 +18,7 @@ from pydantic import Field, Strict, model_validator
 from drivers.device_clock import DeviceClock
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from drivers.interfaces import Clock
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 from drivers.openni2.api import DeviceProperty, PixelFormat
 from drivers.openni2.errors import OpenNI2Error, driver_errors
 from drivers.openni2.opening import ANY, Streams, open_streams

@@ -11,7 +11,6 @@ from importlib import metadata
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from drivers import gardasoft
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -19,11 +18,12 @@ from drivers.errors import (
     DeviceTimeoutError,
     DriverError,
 )
-from drivers.gardasoft_channel import GardasoftChannel, error_text
-from drivers.gardasoft_link import GardasoftLink, NetworkPort, Transport
-from drivers.gardasoft_options import LightOptions
+from drivers.gardasoft import protocol as gardasoft
+from drivers.gardasoft.channel import GardasoftChannel, error_text
+from drivers.gardasoft.link import GardasoftLink, NetworkPort, Transport
+from drivers.gardasoft.on_timer import OnTimer
+from drivers.gardasoft.options import LightOptions
 from drivers.interfaces import Clock
-from drivers.on_timer import OnTimer
 from drivers.serial_port import SerialPort
 from surfclass.errors import InputError
 from surfclass.schema import validate

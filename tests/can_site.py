@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm_can import canopen, dbc
-from drivers.can_options import BusOptions
+from drivers.canbus.options import BusOptions
 from drivers.clock import SystemClock
+from drivers.emulators.can_bridge import BusEnd, CanBridge
+from drivers.emulators.can_nodes import COUNTS_PER_TURN, NODE_IDS, ZERO_COUNTS, CiaNodes
+from drivers.emulators.slcan_adapter import SlcanAdapter
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceTimeoutError
-from drivers.sim.can_bridge import BusEnd, CanBridge
-from drivers.sim.can_nodes import COUNTS_PER_TURN, NODE_IDS, ZERO_COUNTS, CiaNodes
-from drivers.sim.slcan_adapter import SlcanAdapter
 
 DBC = Path(__file__).resolve().parents[1] / "systemd/can_joints.dbc"
 MESSAGES = ("Joints12", "Joints34", "Joints56")

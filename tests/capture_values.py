@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.captures_csv import COLUMNS
-from drivers.recording_format import capture_images
+from drivers.recordings.captures_csv import COLUMNS
+from drivers.recordings.format import capture_images
 from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
 from surfclass.types import Transform
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import cv2
 
-from drivers.captures_csv import COLUMNS
-from drivers.recording import Recording, RecordingWriter
+from drivers.recordings import Recording, RecordingWriter
+from drivers.recordings.captures_csv import COLUMNS
 from drivers.sensor_package import SensorPackage
 from drivers.sim import truth
 from drivers.sim.devices import SimArm, SimColourCamera, SimDepthCamera, SimLight

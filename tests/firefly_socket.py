@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from drivers.bayer import Pattern
-from drivers.sim.firefly import Firefly, Ramps, Source
+from drivers.emulators.firefly import Firefly, Ramps, Source
 
 STALL = -9  # LIBUSB_ERROR_PIPE: there is no such register
 _HEAD = struct.Struct("<BBHHH")  # of a control request: type, request, value, index, length

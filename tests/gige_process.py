@@ -23,7 +23,7 @@ from typing import IO
 
 import pytest
 
-from drivers.sim.gige_library import GVCP_PORT
+from drivers.emulators.gige_library import GVCP_PORT
 
 SERIAL = f"T{os.getpid()}"
 ADDRESS = os.environ.get("GIGE_TEST_ADDRESS", "127.0.0.1")
@@ -68,7 +68,7 @@ def _lock() -> IO[str]:
 
 
 class GigeProcess:
-    """`python -m drivers.sim.gige_camera`; stopped when it is not needed."""
+    """`python -m drivers.emulators.gige_camera`; stopped when it is not needed."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
@@ -78,7 +78,7 @@ class GigeProcess:
             return
         _lock()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "drivers.sim.gige_camera", *_ARGUMENTS],
+            [sys.executable, "-m", "drivers.emulators.gige_camera", *_ARGUMENTS],
             cwd=_ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -94,7 +94,7 @@ class GigeProcess:
             raise AssertionError(why)
 
     def tell(self, line: str) -> str:
-        """Has the camera obey a line (drivers.sim.gige_camera.obey), and returns its answer."""
+        """Has the camera obey a line (drivers.emulators.gige_camera.obey), and returns its answer."""
         assert self._process is not None
         assert self._process.stdin is not None
         assert self._process.stdout is not None

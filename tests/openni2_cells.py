@@ -27,7 +27,7 @@ def writer(path, latency_s=0.04):
     """A virtual Kinect in a process of its own, publishing; to be killed."""
     script = (
         "import sys, threading\nfrom pathlib import Path\nfrom openni2_cells import Counting\n"
-        "from drivers.sim.virtual_kinect import VirtualKinect\n"
+        "from drivers.emulators.virtual_kinect import VirtualKinect\n"
         f"with VirtualKinect(Counting(), Path(sys.argv[1]), latency_s={latency_s}):\n"
         "    print('ready', flush=True)\n    threading.Event().wait()\n"
     )

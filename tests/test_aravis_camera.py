@@ -12,7 +12,7 @@ import gige_process
 import numpy as np
 import pytest
 
-from drivers.aravis_library import Found, Library
+from drivers.aravis.library import Found, Library
 from drivers.clock import SystemClock
 from drivers.colour_aravis import colour, in_process
 from drivers.errors import (

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.aravis_formats import best, parse
-from drivers.aravis_library import GenicamError
-from drivers.aravis_options import AravisOptions
-from drivers.aravis_settings import set_up
+from drivers.aravis.formats import best, parse
+from drivers.aravis.library import GenicamError
+from drivers.aravis.options import AravisOptions
+from drivers.aravis.settings import set_up
 from drivers.bayer import demosaic, mosaic
 from drivers.errors import DeviceFaultError
 from surfclass.errors import ConfigurationError, InputError

@@ -7,10 +7,10 @@ import time
 
 import pytest
 
-from drivers import aravis_timing
-from drivers.aravis_control import ControlThread
-from drivers.aravis_library import Buffer, GenicamError
-from drivers.aravis_timing import Arrivals, Exposures, FrameCount, Trigger
+from drivers.aravis import timing as aravis_timing
+from drivers.aravis.control import ControlThread
+from drivers.aravis.library import Buffer, GenicamError
+from drivers.aravis.timing import Arrivals, Exposures, FrameCount, Trigger
 from drivers.errors import DeviceFaultError
 
 MS = 1_000_000

@@ -124,3 +124,22 @@ def test_the_decisions_are_all_listed():
     pages = {path.name for path in (ROOT / "docs/decisions").glob("0*.md")}
     listed = set(re.findall(r"\((0[^)]+)\)", (ROOT / "docs/decisions/README.md").read_text()))
     assert pages == listed
+
+
+# Vendor libraries and their one door; emulators may know the library whose other end they are.
+DOORS = {
+    "gi": {"drivers/aravis/library.py"},
+    "can": {"drivers/canbus/bus.py"},
+    "cantools": {"drivers/canbus/layout.py"},
+    "canopen": {"drivers/canbus/objects.py", "drivers/emulators/can_nodes.py"},
+    "serial": {"drivers/serial_port.py"},
+    "linuxpy": {"drivers/v4l2/node.py"},
+}
+
+
+@pytest.mark.parametrize("library", DOORS)
+def test_a_vendor_library_has_one_door(library):
+    wanted = re.compile(rf"^\s*(?:import|from) {library}\b|import_module\(\"{library}[\".]", re.MULTILINE)
+    found = {str(path.relative_to(ROOT)) for path in modules() if wanted.search(path.read_text())}
+    assert found <= DOORS[library]
+    assert found, "the door has moved"

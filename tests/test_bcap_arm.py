@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from drivers.arm_bcap import arm
-from drivers.bcap_result import Result
+from drivers.bcap.result import Result
 from drivers.clock import SystemClock
+from drivers.emulators.bcap_controller import BcapController
+from drivers.emulators.bcap_machine import BcapFaults
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -20,8 +22,6 @@ from drivers.errors import (
     DeviceTimeoutError,
     DriverError,
 )
-from drivers.sim.bcap_controller import BcapController
-from drivers.sim.bcap_machine import BcapFaults
 from surfclass.errors import ConfigurationError
 
 REST = np.array([0.1, -0.2, 1.5, 0.3, -0.4, 0.5])

@@ -8,10 +8,10 @@ from collections import deque
 
 import pytest
 
-from drivers.bcap import Function, Packet
-from drivers.bcap_client import BcapClient, CallRefusedError
-from drivers.bcap_result import Result, signed
-from drivers.bcap_variant import EMPTY, PacketError, bstr, i4
+from drivers.bcap.client import BcapClient, CallRefusedError
+from drivers.bcap.packet import Function, Packet
+from drivers.bcap.result import Result, signed
+from drivers.bcap.variant import EMPTY, PacketError, bstr, i4
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceTimeoutError
 
 

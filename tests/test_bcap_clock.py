@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from drivers.bcap_clock import ReplyClock, Stamp
+from drivers.bcap.stamps import ReplyClock, Stamp
 
 MS = 1_000_000
 BOOT = 5_000 * MS

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers import bcap
-from drivers.bcap import Function, Packet
-from drivers.bcap_result import Result, unsigned
-from drivers.bcap_variant import EMPTY, Type, Variant, bstr, i4
-from drivers.sim.bcap_controller import BcapController
+from drivers.bcap import packet as bcap
+from drivers.bcap.packet import Function, Packet
+from drivers.bcap.result import Result, unsigned
+from drivers.bcap.variant import EMPTY, Type, Variant, bstr, i4
+from drivers.emulators.bcap_controller import BcapController
 
 ANGLES = np.radians([10.0, 20.0, 90.0, -30.0, 40.0, 50.0])
 

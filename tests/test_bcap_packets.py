@@ -10,10 +10,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers import bcap
-from drivers.bcap import Function, Packet, decode, encode
-from drivers.bcap_result import Result, describe, failed, signed, unsigned
-from drivers.bcap_variant import EMPTY, PacketError, Type, Variant, bstr, i4, r8_array
+from drivers.bcap import packet as bcap
+from drivers.bcap.packet import Function, Packet, decode, encode
+from drivers.bcap.result import Result, describe, failed, signed, unsigned
+from drivers.bcap.variant import EMPTY, PacketError, Type, Variant, bstr, i4, r8_array
 
 ANGLES = struct.unpack(
     "<8d",

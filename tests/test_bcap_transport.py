@@ -13,9 +13,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.bcap import MAX_DATAGRAM, Function, Packet, encode
-from drivers.bcap_transport import SerialLink, TcpLink, UdpLink
-from drivers.bcap_variant import PacketError, Type, Variant, bstr, i4, r8_array
+from drivers.bcap.packet import MAX_DATAGRAM, Function, Packet, encode
+from drivers.bcap.transport import SerialLink, TcpLink, UdpLink
+from drivers.bcap.variant import PacketError, Type, Variant, bstr, i4, r8_array
 from drivers.errors import DeviceLostError, DeviceNotFoundError
 
 REQUEST = Packet(1, 0, Function.SERVICE_START)

@@ -12,11 +12,12 @@ import can_site
 import numpy as np
 import pytest
 
-import drivers.can_bus
+import drivers.canbus.bus
 from drivers.backends import create
-from drivers.can_joints import JointSet
-from drivers.can_stamps import Arrivals, Span
+from drivers.canbus.joints import JointSet
+from drivers.canbus.stamps import Arrivals, Span
 from drivers.clock import SystemClock
+from drivers.emulators.slcan_adapter import SlcanAdapter
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -24,7 +25,6 @@ from drivers.errors import (
     DeviceTimeoutError,
     DriverUnavailableError,
 )
-from drivers.sim.slcan_adapter import SlcanAdapter
 from surfclass.errors import ConfigurationError, InputError
 
 
@@ -180,7 +180,7 @@ def test_it_sends_nothing(tmp_path):
             arm.about()
         assert list(end.heard) == []
         with pytest.raises(DeviceLostError, match="listening only"):
-            drivers.can_bus.CanBus(
+            drivers.canbus.bus.CanBus(
                 "arm", SimpleNamespace(interface="virtual", channel="x", bitrate=None)
             ).send(1, b"")
     with can_site.bridge_by_slcan(tmp_path / "can") as (_, adapter):
@@ -209,7 +209,7 @@ class WallClock:
         monkeypatch.setattr(can.interfaces.virtual, "time", SimpleNamespace(time=self.now))
         monkeypatch.setattr(can.bus, "time", self.now)
         monkeypatch.setattr(
-            drivers.can_bus,
+            drivers.canbus.bus,
             "Arrivals",
             lambda: Arrivals(wall_ns=lambda: time.time_ns() + round(self.ahead_s * 1e9)),
         )

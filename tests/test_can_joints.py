@@ -3,8 +3,8 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can_joints import CountedSets, SetCounts, SyncedSets
-from drivers.can_stamps import Span
+from drivers.canbus.joints import CountedSets, SetCounts, SyncedSets
+from drivers.canbus.stamps import Span
 
 PERIOD_NS = 10_000_000
 MODULUS = 16

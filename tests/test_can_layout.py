@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.can_layout import DbcOptions, ImpossibleAngleError, Layout
-from drivers.sim.can_bridge import JOINT_IDS, joint_frames
+from drivers.canbus.layout import DbcOptions, ImpossibleAngleError, Layout
+from drivers.emulators.can_bridge import JOINT_IDS, joint_frames
 from surfclass.errors import ConfigurationError
 from surfclass.schema import validate
 

@@ -7,9 +7,9 @@ import time
 import can_site
 import pytest
 
-from drivers.can_nodes import JointNode
+from drivers.canbus.nodes import JointNode
+from drivers.emulators.can_nodes import COUNTS_PER_TURN
 from drivers.errors import DeviceFaultError, DeviceNotFoundError, DeviceTimeoutError, DriverError
-from drivers.sim.can_nodes import COUNTS_PER_TURN
 from surfclass.errors import ConfigurationError
 
 COUNT_RAD = math.tau / COUNTS_PER_TURN

@@ -5,7 +5,7 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can_stamps import Arrivals
+from drivers.canbus.stamps import Arrivals
 
 START_NS = 5_000_000_000_000
 WALL_NS = 1_790_000_000_000_000_000

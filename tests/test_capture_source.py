@@ -23,8 +23,8 @@ from drivers.capture_source import (
 )
 from drivers.clock import SystemClock
 from drivers.errors import CaptureRejectedError, DriverUnavailableError
-from drivers.recording import Recording, RecordingWriter
-from drivers.replay import RecordingSource
+from drivers.recordings import Recording, RecordingWriter
+from drivers.recordings.replay import RecordingSource
 from drivers.sensor_package import SensorPackage
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import Capture
@@ -226,7 +226,7 @@ def test_a_bad_recording_is_an_input_error(recording: Path) -> None:
 
 
 def test_real_poses_without_joints_run(shared: Path, tmp_path: Path) -> None:
-    from drivers.folder import read_folder
+    from drivers.recordings.folder import read_folder
 
     folder = read_folder(shared / "data" / "kitchen")
     with RecordingWriter(tmp_path / "k.mcap", folder.rig_text, folder.classes_text) as writer:

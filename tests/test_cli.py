@@ -18,7 +18,7 @@ from cli_site import (
 )
 from mcap.reader import make_reader
 
-from drivers.recording import Recording, RecordingWriter
+from drivers.recordings import Recording, RecordingWriter
 from surfclass.map_file import from_npz_bytes
 
 FIGURES = {"overall", "balanced", "ece", "nll", "rejected", "voxels", "confusion"}

@@ -12,7 +12,7 @@ import pytest
 from cli_site import CLASSES, rewritten, rows_of, state_of, surfclass, write_png, write_rows
 
 from daemon.offline import import_folder
-from drivers.recording import Recording
+from drivers.recordings import Recording
 from surfclass.map_file import to_npz_bytes
 from surfclass.rig import SurfaceClasses
 from surfclass.voxel_map import VoxelMap

@@ -18,7 +18,7 @@ from cli_site import (
 
 from daemon.console import MapClient
 from daemon.transport import RefusedError, TransportError, ask, open_session
-from drivers.recording import Recording
+from drivers.recordings import Recording
 from surfclass.map_file import from_npz_bytes
 
 

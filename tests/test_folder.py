@@ -24,7 +24,7 @@ from capture_values import (
     write_rows,
 )
 
-from drivers.folder import FolderSet, read_folder
+from drivers.recordings.folder import FolderSet, read_folder
 from surfclass.errors import ConfigurationError, InputError, MissingCalibrationError
 from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
 from surfclass.rig import DepthRig, Rig

@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import gardasoft
-from drivers.gardasoft import Event, GardasoftError, Reply, ReplyReader, Version
+from drivers.gardasoft import protocol as gardasoft
+from drivers.gardasoft.protocol import Event, GardasoftError, Reply, ReplyReader, Version
 
 STATUS = (
     "CH 1, MD 0, S 50.0%, DL 0.010ms, PU 1.000ms, RT 0.0ms, IP 1, FL 0, CS 0.000A, RA 0.700A",

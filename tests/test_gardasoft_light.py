@@ -12,6 +12,8 @@ import pytest
 
 from drivers import backends
 from drivers.clock import SystemClock
+from drivers.emulators.led_controller import LedController
+from drivers.emulators.led_outputs import LedOutputs
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -19,10 +21,8 @@ from drivers.errors import (
     DeviceTimeoutError,
     DriverError,
 )
-from drivers.gardasoft_options import LightOptions
+from drivers.gardasoft.options import LightOptions
 from drivers.light_gardasoft import GardasoftLight
-from drivers.sim.led_controller import LedController
-from drivers.sim.led_outputs import LedOutputs
 from surfclass.errors import ConfigurationError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -141,14 +141,16 @@ class TestOpening:
     def test_a_rating_that_is_not_taken_is_a_fault(self, controller, made, monkeypatch):
         monkeypatch.setattr(controller.outputs, "_rate", lambda numbers: "")
         controller.outputs.execute(b"RS1,0")
-        monkeypatch.setattr("drivers.sim.led_outputs._status_text", lambda *_: "CH 1, S 0.0%, RA 2.000A")
+        monkeypatch.setattr(
+            "drivers.emulators.led_outputs._status_text", lambda *_: "CH 1, S 0.0%, RA 2.000A"
+        )
         light = made()
         with pytest.raises(DeviceFaultError, match=r"0\.7 for the current.*2\.000A"):
             light.open()
         assert not light.is_open
 
     def test_a_firmware_with_another_status_can_be_used_but_is_noted(self, controller, made, monkeypatch):
-        monkeypatch.setattr("drivers.sim.led_outputs._status_text", lambda *_: "all is well")
+        monkeypatch.setattr("drivers.emulators.led_outputs._status_text", lambda *_: "all is well")
         light = made()
         light.open()
         light.set_level(0.5)
@@ -158,7 +160,7 @@ class TestOpening:
         assert "not read back" in about["settings"]
 
     def test_a_channel_that_is_not_there_is_a_fault(self, made, monkeypatch):
-        monkeypatch.setattr("drivers.sim.led_outputs._CHANNELS", 2)
+        monkeypatch.setattr("drivers.emulators.led_outputs._CHANNELS", 2)
         with pytest.raises(DeviceFaultError, match="Err 1: a parameter is invalid"):
             made(channel=3).open()
 
@@ -459,7 +461,8 @@ class TestLoss:
     def test_an_emulator_that_is_killed_is_lost_and_its_successor_found(self, tmp_path, made):
         link = tmp_path / "killed"
         program = (
-            "import sys; from drivers.sim.led_controller import LedController as C; c = C(None, sys.argv[1]);"
+            "import sys; from drivers.emulators.led_controller import LedController;"
+            "c = LedController(None, sys.argv[1]);"
             "c.start(); print('here', flush=True); c.wait()"
         )
 

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers import gardasoft
 from drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
-from drivers.gardasoft import Event
-from drivers.gardasoft_link import GardasoftLink, NetworkPort
+from drivers.gardasoft import protocol as gardasoft
+from drivers.gardasoft.link import GardasoftLink, NetworkPort
+from drivers.gardasoft.protocol import Event
 
 VERSION = b"RT860F-20 (HW02) V031\n\r"
 OFF = gardasoft.continuous(1, 0)

@@ -11,9 +11,9 @@ import pytest
 from drivers.bayer import demosaic, mosaic, unpack
 from drivers.clock import SystemClock
 from drivers.colour_aravis import in_process
+from drivers.emulators.gige_camera import GigeCamera, obey
+from drivers.emulators.gige_image import FORMATS, Processing, encoded
 from drivers.errors import DeviceTimeoutError
-from drivers.sim.gige_camera import GigeCamera, obey
-from drivers.sim.gige_image import FORMATS, Processing, encoded
 from surfclass.errors import InputError
 
 WIDTH, HEIGHT = 32, 24

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers import dc1394_types as types
 from drivers.clock import SystemClock
 from drivers.colour_iidc import colour, in_process
 from drivers.errors import DeviceNotFoundError, DriverUnavailableError
+from drivers.iidc import dc1394_types as types
 
 HEADERS = Path("/usr/include/dc1394/dc1394.h")
 OPTIONS = {"exposure_us": 5000.0, "gain_db": 0.0}
@@ -85,7 +85,7 @@ def test_structures_and_numbers_are_those_of_the_headers(tmp_path):
 def test_every_function_of_the_binding_is_in_the_headers_with_as_many_arguments():
     if not HEADERS.exists():
         pytest.skip("needs libdc1394-dev")
-    from drivers.dc1394 import CALLS
+    from drivers.iidc.dc1394 import CALLS
 
     text = "".join(path.read_text(errors="replace") for path in HEADERS.parent.glob("*.h"))
     text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
@@ -111,7 +111,7 @@ def test_without_a_camera_opening_says_so_at_once():
 
 
 def test_a_missing_library_is_told_with_its_package(monkeypatch):
-    monkeypatch.setattr("drivers.dc1394.LIBRARY", "libdc1394.so.none")
+    monkeypatch.setattr("drivers.iidc.dc1394.LIBRARY", "libdc1394.so.none")
     camera = in_process(name="colour", clock=SystemClock(), options=OPTIONS, shared={})
     with pytest.raises(DriverUnavailableError, match="libdc1394-25"):
         camera.open()

@@ -19,9 +19,9 @@ from firefly_socket import FireflySocket, build_libusb
 from drivers.bayer import demosaic
 from drivers.clock import SystemClock
 from drivers.colour_iidc import colour
+from drivers.emulators.firefly_registers import GAIN, GAMMA, SHUTTER, WHITE_BALANCE
 from drivers.errors import DeviceLostError, DeviceTimeoutError
-from drivers.isolation import IsolatedCamera
-from drivers.sim.firefly_registers import GAIN, GAMMA, SHUTTER, WHITE_BALANCE
+from drivers.isolation.camera import IsolatedCamera
 from surfclass.errors import ConfigurationError
 
 WAIT_S = 5.0  # for a frame that comes, on a busy computer

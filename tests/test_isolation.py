@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from isolated_doubles import picture
 
-from drivers import errors, isolation
+from drivers import errors
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceTimeoutError, DriverUnavailableError
-from drivers.isolation import IsolatedCamera
+from drivers.isolation import camera as isolation
+from drivers.isolation.camera import IsolatedCamera
 from surfclass import errors as input_errors
 from surfclass.errors import ConfigurationError, InputError
 
@@ -527,7 +528,7 @@ class TestProcess:
 
 PARENT = """
 import os, sys, threading, time
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 deed, *closed = sys.argv[1:]
 options = {"deeds": {"grab": deed} if deed != "idle" else {}}
 if closed:
@@ -543,7 +544,7 @@ with IsolatedCamera(
 
 PARENT_OF_A_BEGINNER = """
 import os, signal, sys, time
-from drivers.child_process import ChildProcess
+from drivers.isolation.child_process import ChildProcess
 child = ChildProcess("depth", {})
 print(child.pid, flush=True)
 time.sleep(float(sys.argv[1]))

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceFaultError
-from drivers.frame_memory import FRAME_LIMIT_BYTES, FrameMemory
-from drivers.isolation_wire import (
+from drivers.isolation.frame_memory import FRAME_LIMIT_BYTES, FrameMemory
+from drivers.isolation.wire import (
     MESSAGE_LIMIT_BYTES,
     WireError,
     decode,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceLostError, DeviceNotFoundError
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 from drivers.openni2.build import build
 from drivers.openni2.errors import PluginMissingError
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.emulators.led_controller import LedController
+from drivers.emulators.led_outputs import CONTINUOUS, PULSE, SWITCHED, LedOutputs, LightHistory
 from drivers.serial_port import SerialPort
-from drivers.sim.led_controller import LedController
-from drivers.sim.led_outputs import CONTINUOUS, PULSE, SWITCHED, LedOutputs, LightHistory
 from surfclass.errors import ConfigurationError
 
 MS = 1_000_000

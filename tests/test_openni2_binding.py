@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from openni2_cells import Counting
 
+from drivers.emulators.virtual_kinect import VirtualKinect
 from drivers.openni2 import api, build, plugins
 from drivers.openni2.device import Device
 from drivers.openni2.errors import OpenNI2Error, PluginMissingError
 from drivers.openni2.runtime import Runtime
-from drivers.sim.virtual_kinect import VirtualKinect
 
 try:
     plugins.system_folder()

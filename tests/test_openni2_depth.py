@@ -14,6 +14,7 @@ from openni2_cells import Counting, ended, until, writer
 
 from drivers import depth_openni2
 from drivers.clock import SystemClock
+from drivers.emulators.virtual_kinect import VirtualKinect
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -28,7 +29,6 @@ from drivers.openni2.errors import PluginMissingError
 from drivers.openni2.pairs import Pairing, whole_millimetres
 from drivers.openni2.reader import KEPT, Reader
 from drivers.openni2.virtual_file import VirtualFile
-from drivers.sim.virtual_kinect import VirtualKinect
 from surfclass.errors import ConfigurationError, InputError
 
 try:

@@ -10,10 +10,10 @@ from openni2_cells import Counting
 from drivers import depth_openni2
 from drivers.clock import SystemClock
 from drivers.depth_openni2 import record_oni
+from drivers.emulators.virtual_kinect import VirtualKinect
 from drivers.errors import DeviceFaultError, DeviceNotFoundError, DriverError
 from drivers.openni2 import build, plugins, record
 from drivers.openni2.errors import PluginMissingError
-from drivers.sim.virtual_kinect import VirtualKinect
 from surfclass.errors import InputError
 
 try:

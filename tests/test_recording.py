@@ -29,9 +29,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from drivers.folder import read_folder
-from drivers.recording import Recording, RecordingWriter, unix_offset_ns
-from drivers.recording_format import METADATA, capture_images
+from drivers.recordings import Recording, RecordingWriter, unix_offset_ns
+from drivers.recordings.folder import read_folder
+from drivers.recordings.format import METADATA, capture_images
 from surfclass.errors import ConfigurationError, InputError, MissingCalibrationError
 from surfclass.frames import ROLES, Capture, ColourFrame, DepthFrame
 
@@ -168,7 +168,7 @@ def test_imported_bytes_are_kept_verbatim(tmp_path: Path, suffix: str) -> None:
 def test_the_same_captures_give_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     some = [capture(seed) for seed in range(4)]
     first = write(tmp_path / "a.mcap", some).read_bytes()
-    monkeypatch.setattr("drivers.recording_file.SYNC_S", 0.0)  # another rhythm of the disk
+    monkeypatch.setattr("drivers.recordings.file.SYNC_S", 0.0)  # another rhythm of the disk
     assert write(tmp_path / "b.mcap", some).read_bytes() == first
     assert write(tmp_path / "c.mcap", some[:3]).read_bytes() != first
 

@@ -15,7 +15,7 @@ from capture_values import CLASSES_TOML, RIG_TOML, assert_same, capture
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from drivers.recording import Recording, RecordingWriter, recover
+from drivers.recordings import Recording, RecordingWriter, recover
 from surfclass.errors import InputError
 
 HERE = Path(__file__).parent
@@ -23,7 +23,7 @@ HERE = Path(__file__).parent
 KILLED = """
 import sys
 from capture_values import CLASSES_TOML, RIG_TOML, capture
-from drivers.recording import RecordingWriter
+from drivers.recordings import RecordingWriter
 writer = RecordingWriter(sys.argv[1], RIG_TOML, CLASSES_TOML, {"robot": "r1"}, map_schema=b"")
 for seed in range(100_000):
     writer.write(capture(seed))
@@ -34,7 +34,7 @@ for seed in range(100_000):
 FULL_DISK = """
 import resource, signal, sys
 from capture_values import CLASSES_TOML, RIG_TOML, capture
-from drivers.recording import RecordingWriter
+from drivers.recordings import RecordingWriter
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 with RecordingWriter(sys.argv[1], RIG_TOML, CLASSES_TOML) as writer:
@@ -117,7 +117,7 @@ def test_after_a_disk_error_nothing_more_is_written(tmp_path: Path, monkeypatch:
 
     writer = RecordingWriter(tmp_path / "a.mcap", RIG_TOML, CLASSES_TOML)
     writer.write(capture(0))
-    monkeypatch.setattr("drivers.recording_file.os.fsync", refuse)
+    monkeypatch.setattr("drivers.recordings.file.os.fsync", refuse)
     with pytest.raises(OSError, match=r"recording stopped.*a\.mcap\.active"):
         writer.sync()
     with pytest.raises(ValueError, match="the recording is closed"):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from openni2_cells import Counting, until
 
+from drivers.emulators.virtual_kinect import VirtualKinect
 from drivers.openni2.call_thread import CallThread, HungError
 from drivers.openni2.virtual_file import Header, VirtualFile
-from drivers.sim.virtual_kinect import VirtualKinect
 from surfclass.errors import InputError
 
 

@@ -17,7 +17,7 @@ from daemon import check, wiring
 from daemon.config import load_config
 from daemon.findings import Verdict, exit_code
 from daemon.transport import TransportError, ask, open_session
-from drivers.recording import Recording
+from drivers.recordings import Recording
 from surfclass.errors import ConfigurationError
 from surfclass.wire import decode_update
 

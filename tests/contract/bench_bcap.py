@@ -12,10 +12,10 @@ import numpy as np
 from bench import Backend, Bench, Trouble
 
 from drivers import backends
-from drivers.bcap_result import Result
+from drivers.bcap.result import Result
 from drivers.clock import SystemClock
-from drivers.sim.bcap_controller import BcapController
-from drivers.sim.bcap_machine import BcapFaults
+from drivers.emulators.bcap_controller import BcapController
+from drivers.emulators.bcap_machine import BcapFaults
 
 
 class RestingArm:

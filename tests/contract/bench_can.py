@@ -13,11 +13,11 @@ import numpy as np
 from bench import Backend, Bench, Trouble
 
 from drivers.arm_can import canopen, dbc
-from drivers.can_options import BusOptions
+from drivers.canbus.options import BusOptions
 from drivers.clock import SystemClock
-from drivers.sim.can_bridge import BridgeFault, BusEnd, CanBridge
-from drivers.sim.can_nodes import COUNTS_PER_TURN, NODE_IDS, ZERO_COUNTS, CiaNodes, NodeFault
-from drivers.sim.slcan_adapter import SlcanAdapter
+from drivers.emulators.can_bridge import BridgeFault, BusEnd, CanBridge
+from drivers.emulators.can_nodes import COUNTS_PER_TURN, NODE_IDS, ZERO_COUNTS, CiaNodes, NodeFault
+from drivers.emulators.slcan_adapter import SlcanAdapter
 from surfclass.types import Float64
 
 DBC = Path(__file__).resolve().parents[2] / "systemd/can_joints.dbc"

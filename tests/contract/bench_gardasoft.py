@@ -13,8 +13,8 @@ from typing import Any
 from bench import Backend, Bench, Trouble
 
 from drivers.clock import SystemClock
+from drivers.emulators.led_controller import LedController, WireFaults
 from drivers.light_gardasoft import light
-from drivers.sim.led_controller import LedController, WireFaults
 
 _EXPOSURE_NS = 10_000_000
 

@@ -24,7 +24,7 @@ from bench import Backend, Bench, Trouble
 from drivers.clock import SystemClock
 from drivers.colour_iidc import in_process
 from drivers.interfaces import ColourCamera
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 from surfclass.frames import ColourFrame
 
 OPTIONS = {
@@ -72,7 +72,7 @@ def stand_in() -> Path:
 def on_a_socket(folder: Path) -> Iterator[Bench]:
     from firefly_socket import FireflySocket
 
-    from drivers.sim.firefly import Faults
+    from drivers.emulators.firefly import Faults
 
     path = folder / "usb"
     environment = {"LD_LIBRARY_PATH": str(stand_in()), "IIDC_USB_SOCKET": str(path)}

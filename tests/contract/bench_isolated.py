@@ -11,7 +11,7 @@ from pathlib import Path
 from bench import Backend, Bench, Trouble
 
 from drivers.clock import SystemClock
-from drivers.isolation import IsolatedCamera
+from drivers.isolation.camera import IsolatedCamera
 from surfclass.frames import ColourFrame, DepthFrame
 
 HERE = Path(__file__).parent

@@ -12,10 +12,10 @@ from bench import Backend, Bench, Trouble
 
 from drivers import depth_openni2
 from drivers.clock import SystemClock
+from drivers.emulators.virtual_kinect import VirtualKinect
 from drivers.openni2.build import build
 from drivers.openni2.errors import PluginMissingError
 from drivers.openni2.plugins import system_folder
-from drivers.sim.virtual_kinect import VirtualKinect
 
 
 class Slope:

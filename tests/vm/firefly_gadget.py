@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from drivers.sim.firefly import Faults, Firefly, Ramps
+from drivers.emulators.firefly import Faults, Firefly, Ramps
 
 GADGET = Path("/sys/kernel/config/usb_gadget/firefly")
 MOUNT = Path("/dev/ffs-firefly")

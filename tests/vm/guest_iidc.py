@@ -10,9 +10,9 @@ from bench_iidc import OPTIONS, gadget
 from drivers import backends
 from drivers.bayer import demosaic
 from drivers.clock import SystemClock
+from drivers.emulators.firefly import Ramps
 from drivers.errors import DeviceLostError, DeviceNotFoundError
-from drivers.isolation import IsolatedCamera
-from drivers.sim.firefly import Ramps
+from drivers.isolation.camera import IsolatedCamera
 
 WAIT_S = 20.0  # for a whole frame under emulation
 PATTERN = "GRBG"

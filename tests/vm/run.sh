@@ -80,6 +80,10 @@ esac
 verdict=0
 [ "${1:-}" = --benchmark ] || "$python" "$here/verdict.py" "$work/host/results.xml" || verdict=1
 echo "vm: $((SECONDS - booted)) s from switching on to power-off, $((SECONDS - started)) s in all"
+if grep -qE 'Oops|BUG: |Kernel panic' "$work/console"; then
+  echo "vm: its kernel crashed; what came after that counts for nothing"
+  verdict=1
+fi
 if [ "$status" -ne 0 ] || [ "$verdict" -ne 0 ]; then
   echo "vm: the last lines of its console:"
   tail -n 30 "$work/console"

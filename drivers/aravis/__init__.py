@@ -1,0 +1,1 @@
+"""What the Aravis backend is made of; the driver is `drivers.colour_aravis`."""

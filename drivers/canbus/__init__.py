@@ -1,0 +1,1 @@
+"""Joint angles from a CAN bus; the driver is `drivers.arm_can`."""

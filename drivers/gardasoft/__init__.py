@@ -1,0 +1,1 @@
+"""What the light's backend is made of; the driver is `drivers.light_gardasoft`."""

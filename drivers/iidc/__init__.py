@@ -1,0 +1,1 @@
+"""What the IIDC backend is made of; the driver is `drivers.colour_iidc`."""

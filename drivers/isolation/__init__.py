@@ -1,0 +1,1 @@
+"""Drivers in processes of their own; `drivers.isolation.camera.camera` is how they are used."""
