@@ -7,6 +7,14 @@ import pytest
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--hardware",
+        metavar="FILE",
+        help="run the contract of drivers on the devices of this configuration, instead of all benches",
+    )
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of reference data beside the project; a test that needs it skips where it is missing."""

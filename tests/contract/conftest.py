@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from bench import Backend, Bench
@@ -23,7 +24,9 @@ BENCHES = (
 )
 
 
-def backends() -> list[Backend]:
+def backends(hardware: str | None) -> list[Backend]:
+    if hardware is not None:
+        return importlib.import_module("bench_hardware").backends(Path(hardware).absolute())
     return [backend for name in BENCHES for backend in importlib.import_module(name).BACKENDS]
 
 
@@ -39,15 +42,21 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     troubles = {mark.args[0] for mark in metafunc.definition.iter_markers("trouble")}
     rows = [
         (backend, kind)
-        for backend in backends()
+        for backend in backends(metafunc.config.getoption("--hardware"))
         for kind in marker.args
         if kind in backend.troubles and troubles <= backend.troubles[kind]
     ]
+    if not rows:
+        rows = [(Backend("no backend", _nowhere, missing="none here can fail in this way"), "")]
     if "kind" in metafunc.fixturenames:
         params = [backend.param(kind) for backend, kind in rows]
         metafunc.parametrize(("bench", "kind"), params, indirect=["bench"])
     else:
         metafunc.parametrize("bench", [backend.param() for backend, _ in rows], indirect=True)
+
+
+def _nowhere(_: Path) -> NoReturn:
+    raise AssertionError("the test is skipped")
 
 
 @pytest.fixture
