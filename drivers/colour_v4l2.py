@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
-from drivers import v4l2_pixels
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -20,10 +19,11 @@ from drivers.errors import (
     DriverUnavailableError,
 )
 from drivers.interfaces import Clock
-from drivers.v4l2_controls import Settings, Wanted
-from drivers.v4l2_node import Filled, Format, VideoNode
-from drivers.v4l2_options import V4l2Options
-from drivers.v4l2_stream import Stream
+from drivers.v4l2 import pixels
+from drivers.v4l2.controls import Settings, Wanted
+from drivers.v4l2.node import Filled, Format, VideoNode
+from drivers.v4l2.options import V4l2Options
+from drivers.v4l2.stream import Stream
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import ColourFrame
 from surfclass.schema import validate
@@ -69,7 +69,7 @@ class V4l2ColourCamera:
         open_node: Callable[[str], VideoNode] = VideoNode,
     ) -> None:
         self._name, self._clock, self._options, self._open_node = name, clock, options, open_node
-        self._layout = v4l2_pixels.layout(options.pixel_format)
+        self._layout = pixels.layout(options.pixel_format)
         try:
             self._layout.row_bytes(options.width)
         except InputError as error:
@@ -207,7 +207,7 @@ class V4l2ColourCamera:
         asked = (options.width, options.height, options.pixel_format)
         if (form.width, form.height, form.pixel_format) != asked:
             known = "; ".join(
-                f"{code}{'' if code in v4l2_pixels.LAYOUTS else ' (not supported)'}: {', '.join(sizes)}"
+                f"{code}{'' if code in pixels.LAYOUTS else ' (not supported)'}: {', '.join(sizes)}"
                 for code, sizes in node.formats().items()
             )
             raise self._fault(
@@ -252,7 +252,7 @@ class V4l2ColourCamera:
         form, exposure_ns = stream.format, stream.settings.exposure_ns
         data = stream.node.data(filled)
         try:
-            rgb = v4l2_pixels.decode(data, stream.layout, form.width, form.height, form.row_bytes)
+            rgb = pixels.decode(data, stream.layout, form.width, form.height, form.row_bytes)
         except InputError as error:
             raise self._fault(f"impossible data: {error}") from None
         exposure_s = None if exposure_ns is None else exposure_ns / 1e9

@@ -18,7 +18,7 @@ from drivers.errors import (
     DriverError,
     DriverUnavailableError,
 )
-from drivers.v4l2_options import V4l2Options
+from drivers.v4l2.options import V4l2Options
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.schema import validate
 
@@ -454,7 +454,7 @@ class TestTheRealNode:
     def open_files(self):
         from pathlib import Path
 
-        from drivers.v4l2_node import _linuxpy
+        from drivers.v4l2.node import _linuxpy
 
         _linuxpy()
         return lambda: len(list(Path("/proc/self/fd").iterdir()))

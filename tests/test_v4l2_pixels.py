@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.bayer import demosaic, packed_row_bytes
-from drivers.v4l2_pixels import LAYOUTS, decode, layout, needed_bytes
+from drivers.v4l2.pixels import LAYOUTS, decode, layout, needed_bytes
 from surfclass.errors import InputError
 
 BAYER = [code for code, each in LAYOUTS.items() if each.pattern]

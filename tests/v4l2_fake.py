@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drivers.v4l2_node import Control, Facts, Filled, Format
+from drivers.v4l2.node import Control, Facts, Filled, Format
 
 MS = 1_000_000
 AUTO_EXPOSURE, EXPOSURE, GAIN, AUTO_GAIN = 0x009A0901, 0x009A0902, 0x00980913, 0x00980912

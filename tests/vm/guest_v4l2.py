@@ -10,7 +10,7 @@ from drivers.backends import create
 from drivers.bayer import demosaic
 from drivers.clock import SystemClock
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundError
-from drivers.v4l2_pixels import layout
+from drivers.v4l2.pixels import layout
 
 WIDTH, HEIGHT = 1280, 960
 SMALL = (640, 480)

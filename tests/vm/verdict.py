@@ -17,6 +17,16 @@ def outcome(case: ET.Element) -> str:
     return kinds[0] if kinds else "passed"
 
 
+def times(cases: list[ET.Element]) -> Counter[str]:
+    """Returns how long the tests of each file took, and of each backend under the contract, s."""
+    took: Counter[str] = Counter()
+    for case in cases:
+        module = case.get("classname", "").split(".test_contract.")[0]
+        backend = case.get("name", "").partition("[")[2].partition("-")[0].rstrip("]")
+        took[f"{module} {backend}" if module == "tests.contract" else module] += float(case.get("time", 0))
+    return took
+
+
 def judge(results: Path) -> int:
     """Prints one line for each test that did not pass, and the counts; returns the exit code.
 
@@ -32,6 +42,8 @@ def judge(results: Path) -> int:
             message = next((child.get("message", "") for child in case if child.tag != "properties"), "")
             first = message.strip().splitlines()[0] if message.strip() else ""
             print(f"vm: {outcome(case)}: {case.get('classname')}::{case.get('name')}: {first:.200}")
+    for what, seconds in sorted(times(cases).items(), key=lambda each: -each[1]):
+        print(f"vm: {seconds:6.1f} s {what}")
     failed = len(cases) - counts["passed"]
     print(f"vm: {counts['passed']} passed, {failed} failed or skipped")
     if not counts["passed"]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
-from drivers import v4l2_pixels, v4l2_time
-from drivers.v4l2_controls import Settings
-from drivers.v4l2_node import Facts, Filled, Format, VideoNode
+from drivers.v4l2 import pixels, times
+from drivers.v4l2.controls import Settings
+from drivers.v4l2.node import Facts, Filled, Format, VideoNode
 
 
 @dataclass
@@ -52,20 +52,18 @@ class Stream:
     node: VideoNode
     facts: Facts
     format: Format
-    layout: v4l2_pixels.Layout
+    layout: pixels.Layout
     period_ns: int
     settings: Settings
     tally: Tally = field(default_factory=Tally)
     delivered: int = 0
-    stamped_at: v4l2_time.StampedAt | None = None
+    stamped_at: times.StampedAt | None = None
     sequence: int = 0
     _stamp_ns: int = 0
     _counter: int | None = None
     _fresh: bool = False
 
-    def judge(
-        self, filled: Filled, fresh: bool, seen_ns: int, not_before_ns: int
-    ) -> v4l2_time.Exposure | None:
+    def judge(self, filled: Filled, fresh: bool, seen_ns: int, not_before_ns: int) -> times.Exposure | None:
         """Returns when a buffer was exposed, or counts why it is no frame to deliver and returns None.
 
         Args:
@@ -79,7 +77,7 @@ class Stream:
         if filled.error:
             self.tally.flagged += 1
             return None
-        if filled.size < v4l2_pixels.needed_bytes(self.layout, form.width, form.height, form.row_bytes):
+        if filled.size < pixels.needed_bytes(self.layout, form.width, form.height, form.row_bytes):
             self.tally.short += 1
             return None
         # A stamp of the frame's end may be a forecast; one of its start cannot, nor can one repeat the last.
@@ -92,7 +90,7 @@ class Stream:
             self.stamped_at = "end of frame"
         else:
             self.stamped_at = "arrival" if self.facts.stamps_arrival else "start of exposure"
-        exposed = v4l2_time.exposure(
+        exposed = times.exposure(
             filled.stamp_ns, self.stamped_at, self.settings.exposure_ns, self.period_ns, seen_ns
         )
         if exposed.began_ns < not_before_ns:

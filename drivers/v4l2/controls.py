@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from drivers.errors import DeviceFaultError
-from drivers.v4l2_node import Control, VideoNode
+from drivers.v4l2.node import Control, VideoNode
 
 # Kernel documentation, "User Control Reference" and "Camera Control Reference", by number, for drivers
 # and kernel versions name them differently; with the value that is off, or by hand. In this order: the
