@@ -256,7 +256,8 @@ def test_every_backend_of_the_table_is_there() -> None:
 
 def test_unknown_backends_and_options_are_named() -> None:
     with pytest.raises(
-        ConfigurationError, match=r"colour\.backend: 'simm', allowed: sim, aravis, iidc, v4l2; did you mean 'sim'\?"
+        ConfigurationError,
+        match=r"colour\.backend: 'simm', allowed: sim, aravis, iidc, v4l2; did you mean 'sim'\?",
     ):
         backends.create("colour", "simm", clock=FakeClock())
     with pytest.raises(

@@ -169,10 +169,8 @@ def test_an_emulator_that_is_killed_is_named_and_used_again_when_it_is_back(site
     assert site.cell.light_level(named_ns, back_ns) == 0.0  # nothing could be captured: no light
     site.kills.append((killed_ns, back_ns))
     site.captures_again(BACK_WITHIN_S + STARTS_WITHIN_S)
-    resumed_s = (time.monotonic_ns() - back_ns) / 1e9
-    print(
-        f"{kind}: named after {(named_ns - killed_ns) / 1e9:.1f} s, captures {resumed_s:.1f} s after its start"
-    )
+    named_s, resumed_s = (named_ns - killed_ns) / 1e9, (time.monotonic_ns() - back_ns) / 1e9
+    print(f"{kind}: named after {named_s:.1f} s, captures {resumed_s:.1f} s after its start")
 
 
 @pytest.mark.parametrize("kind", ["depth", "colour"])
