@@ -140,6 +140,7 @@ def test_a_line_triggers_and_nothing_else_does(scene, emulated):
         with pytest.raises(DeviceTimeoutError):
             grab(camera, 0.2)
         asked_ns = time.monotonic_ns()
+        time.sleep(0.1)  # more than the frame's time is uncertain by: it must certainly have begun after
         emulated.pulse("Line0")
         frame = camera.grab(asked_ns, 3.0)
         assert len(scene.asked) == 1
