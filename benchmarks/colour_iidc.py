@@ -29,7 +29,7 @@ from drivers.isolation.camera import IsolatedCamera
 ROOT = Path(__file__).resolve().parents[1]
 ROUNDS = 60
 OPTIONS = {"mode": "1280x960_mono8", "exposure_us": 1000.0, "gain_db": 0.0}
-_MODE_1280X960_MONO8, _FRAMERATE_15, _SHUTTER = 81, 35, 423
+_MODE_1280X960_MONO8, _FRAMERATE_15, _SHUTTER, _MANUAL = 81, 35, 423, 736
 
 
 def measured(grab: Callable[[], object]) -> dict[str, float]:
@@ -51,6 +51,7 @@ def bare() -> dict[str, float]:
     camera.call("video_set_transmission", 0)
     camera.call("video_set_mode", _MODE_1280X960_MONO8)
     camera.call("video_set_framerate", _FRAMERATE_15)
+    camera.call("feature_set_mode", _SHUTTER, _MANUAL)
     camera.call("feature_set_absolute_control", _SHUTTER, 1)
     camera.call("feature_set_absolute_value", _SHUTTER, ctypes.c_float(0.001))
     camera.call("external_trigger_set_mode", TRIGGER_MODE_0)
