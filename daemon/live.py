@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from daemon import wiring
@@ -233,7 +234,8 @@ def check(config: Path | None, overrides: Sequence[str], json_file: str | None) 
     for heading in ("", "what", "found", "what to do"):
         table.add_column(heading, overflow="fold")
     for finding in findings:
-        table.add_row(_MARKS[finding.verdict], finding.subject, finding.message, finding.advice)
+        told = (finding.subject, finding.message, finding.advice)
+        table.add_row(_MARKS[finding.verdict], *map(escape, told))
     console.print(table)
     if json_file is not None:
         write_json(json_file, [finding.as_json() for finding in findings])

@@ -147,6 +147,14 @@ class TestWatch:
 
 
 class TestCheck:
+    def test_what_to_do_is_told_word_for_word(self, commissioned, tmp_path):
+        text = commissioned.configuration(tmp_path).read_text()
+        configuration = tmp_path / "silent.toml"
+        table = text[text.index("[recording]") : text.index("[zenoh]")]
+        configuration.write_text(text.replace(table, ""))
+        done = surfclass("check", "-c", configuration, cwd=tmp_path)
+        assert "add a [recording] table to keep them" in done.stderr
+
     def test_everything_works(self, commissioned, tmp_path):
         configuration = commissioned.configuration(tmp_path)
         (tmp_path / "recordings").mkdir()
