@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -17,6 +16,7 @@ from rich.table import Table
 
 from daemon.emulators import READY
 from daemon.offline import console
+from drivers.emulators.ports import free_port
 from drivers.files import write_atomically
 from drivers.sim.cell import WorldCell, host_cell
 from drivers.sim.cell_server import CellServer
@@ -63,7 +63,7 @@ def run_cell(
     (folder / DEVICES).unlink(missing_ok=True)
     with console.status(f"making the scene {scene}"):
         cell = make(scene, seed)
-    places = Places(folder.resolve(), _free_port())
+    places = Places(folder.resolve(), free_port())
     with CellServer(cell, places.socket, make) as server:
         devices = [Emulator(name, arguments) for name, arguments in places.commands().items()]
         try:
@@ -191,12 +191,6 @@ def _tell(folder: Path, devices: list[Emulator]) -> None:
     for device in devices:
         table.add_row(device.name, "gone" if device.pid is None else str(device.pid))
     console.print(table)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 _TABLES = """\

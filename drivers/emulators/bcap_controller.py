@@ -19,6 +19,7 @@ from typing import Literal, Self
 
 from drivers.emulators.bcap_machine import BcapFaults, Call, Joints, Machine
 from drivers.emulators.bcap_peer import HangUpError, Peer
+from drivers.emulators.ports import free_port
 
 _SEND_TIMEOUT_S = 1.0
 _PAUSE_S = 0.05  # on a serial line, within no request
@@ -221,21 +222,15 @@ class _Stop:
 
 def _bound(host: str, port: int) -> tuple[socket.socket, socket.socket]:
     """Returns sockets of TCP and UDP that have the same port; for 0 one that is free in both."""
-    refused: list[OSError] = []
-    while len(refused) < (1 if port else 16):
-        tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            tcp.bind((host, port))
-            udp.bind((host, tcp.getsockname()[1]))
-        except OSError as error:
-            tcp.close()
-            udp.close()
-            refused.append(error)
-        else:
-            return tcp, udp
-    raise refused[-1]
+    port = port or free_port(host)
+    with contextlib.ExitStack() as made:
+        tcp = made.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+        udp = made.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        tcp.bind((host, port))
+        udp.bind((host, port))
+        made.pop_all()
+        return tcp, udp
 
 
 def _is_over(peer: Peer) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import socket
@@ -17,11 +18,13 @@ from types import TracebackType
 from typing import Literal, Protocol, Self
 
 from drivers.emulators.led_outputs import LedOutputs
+from drivers.emulators.ports import free_port
 from surfclass.errors import ConfigurationError
 
 _LONGEST_LINE = 256
 _NONSENSE = bytes(range(0x80, 0xA0)) + b"\xff>\x81"
 _LATEST_COMMANDS = 10_000
+_UNPLUGGED_WITHIN_S = 1.0  # the thread's poll() may hold a socket that was closed so long
 
 
 class Lamp(Protocol):
@@ -224,16 +227,21 @@ class LedController:
             raise ConfigurationError(f"{self.link_path}: the link cannot be made: {error}") from error
 
     def _bound(self, kind: socket.SocketKind, port: int) -> socket.socket:
-        made = socket.socket(socket.AF_INET, kind)
-        try:
-            if kind == socket.SOCK_STREAM:
-                made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            made.bind(("127.0.0.1", port))
-        except OSError as error:
-            made.close()
-            raise ConfigurationError(f"port {port} of 127.0.0.1: {error}") from error
-        made.setblocking(False)
-        return made
+        until = time.monotonic() + _UNPLUGGED_WITHIN_S
+        while True:
+            made = socket.socket(socket.AF_INET, kind)
+            try:
+                if kind == socket.SOCK_STREAM:
+                    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                made.bind(("127.0.0.1", port or free_port()))
+            except OSError as error:
+                made.close()
+                if error.errno == errno.EADDRINUSE and time.monotonic() < until:
+                    time.sleep(0.01)
+                    continue
+                raise ConfigurationError(f"port {port} of 127.0.0.1: {error}") from error
+            made.setblocking(False)
+            return made
 
     # ---- the thread -------------------------------------------------------------------------
 
