@@ -59,8 +59,8 @@ pip=("$python" -m pip --quiet --disable-pip-version-check --no-input)
   --target "$work/payload/installed" "$work"/*.whl
 (cd "$root" && tar -cf - --exclude=__pycache__ pyproject.toml systemd tests benchmarks) | tar -C "$work/payload" -xf -
 # For no arguments printf would print an empty one, which pytest takes for the folder that it stands in.
+: >"$work/payload/arguments"
 [ $# -eq 0 ] || printf '%q ' "$@" >"$work/payload/arguments"
-[ -e "$work/payload/arguments" ] || : >"$work/payload/arguments"
 tar -C "$work/payload" -cf "$work/host/payload.tar" .
 
 # All that can be emulated, but for what costs more than it gives: wide vectors, deep page tables, rights
