@@ -182,7 +182,7 @@ def test_a_drivers_own_process_that_is_killed_is_replaced(site, kind):
     site.until(
         lambda: site.status["devices"][kind]["process"] not in (None, pid), BACK_WITHIN_S, "a new process"
     )
-    site.kills.append((killed_ns, killed_ns))
+    site.kills.append((killed_ns, time.monotonic_ns()))
     site.captures_again(BACK_WITHIN_S)
     print(f"{kind}: captures {(time.monotonic_ns() - killed_ns) / 1e9:.1f} s after its process was killed")
     assert f"{kind}: its process was killed by SIGKILL" in site.log.read_text()
@@ -197,8 +197,10 @@ def test_no_capture_is_of_before_and_after_a_loss(site):
     assert len(captures) > len(site.kills)
     for capture in captures:
         times = capture.colour.t_ns, capture.depth.t_ns, capture.joints.t_ns
-        for killed_ns, _ in site.kills:
-            assert max(times) < killed_ns or min(times) > killed_ns
+        # A frame that was whole before another device was killed is as good as ever; what no capture may
+        # hold is something from before a loss beside something from after the device's return.
+        for killed_ns, back_ns in site.kills:
+            assert max(times) < back_ns or min(times) > killed_ns
         assert capture.light_timing == "software"
         assert capture.colour.t_sd_ns > 0
         assert capture.depth.t_sd_ns > 0
