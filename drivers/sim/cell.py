@@ -125,7 +125,7 @@ class WorldCell:
     def prepare(self) -> None:
         """Where the arm stands still, computes what the next colour image from there needs.
 
-        For an emulated camera whose library answers nothing while it waits for pixels.
+        A first image from a place takes a second or more, which no camera needs.
         """
         now_ns = time.monotonic_ns()
         q = self.world.joints(now_ns)
