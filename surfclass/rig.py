@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from surfclass.errors import InputError, MissingCalibrationError
 from surfclass.frames import Capture
-from surfclass.schema import Number, Positive, Table, Vector3, parse_toml
+from surfclass.schema import Number, Positive, Table, Vector3, parse_toml, validate
 from surfclass.types import Float64, Transform
 
 SCHEMA = 1
@@ -233,6 +234,19 @@ class DepthRig(Table):
                         f"{says} {shape[1]} × {shape[0]}"
                     )
 
+    def with_values(self, values: Mapping[str, Any]) -> DepthRig:
+        """Returns the rig with some of its keys set anew.
+
+        Args:
+            values: Nested as in `rig.toml`; a table is merged key by key, anything else replaces.
+
+        Raises:
+            ConfigurationError: Naming every fault by its path.
+        """
+        told = merged(self.model_dump(by_alias=True, exclude_unset=True), values)
+        rig = validate(DepthRig, told, f"rig {self.name}")
+        return rig if rig.missing else rig.whole()
+
     def whole(self) -> Rig:
         """Returns the rig with its colour camera and where that is.
 
@@ -286,6 +300,17 @@ class SurfaceClasses(Table):
     def rgb(self) -> NDArray[np.uint8]:
         """(k, 3) uint8."""
         return np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in self.colours], np.uint8)
+
+
+def merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns `old` with what `new` sets; tables are merged key by key."""
+    result = dict(old)
+    for key, given in new.items():
+        value, below = given, result.get(key)
+        if isinstance(value, Mapping) and isinstance(below, Mapping):
+            value = merged(below, value)
+        result[key] = value
+    return result
 
 
 def parse_rig(text: str | bytes, source: str) -> Rig:

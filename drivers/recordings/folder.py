@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,12 @@ class FolderSet:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def only(self, roles: Collection[str]) -> FolderSet:
+        """Returns the captures of these roles; no other's images are read."""
+        kept = [i for i, row in enumerate(self.rows) if row.role in roles]
+        rows, files = tuple(self.rows[i] for i in kept), tuple(self.files[i] for i in kept)
+        return replace(self, rows=rows, files=files)
 
     def captures(self) -> Iterator[tuple[Capture, dict[str, bytes]]]:
         """Yields each capture with the bytes of its image files by kind, in the order of the rows.

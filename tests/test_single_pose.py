@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from calibration.hand_eye.single_pose import align, disc_centre, fit_circle, hand_eye_of_pose, plane_basis
 from surfclass.errors import InputError
-from surfclass.hand_eye import align, disc_centre, fit_circle, hand_eye_of_pose, plane_basis
 from surfclass.kinematics import forward_kinematics
 from surfclass.types import Transform
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from raycast import make_rig, pixel_rays, tilted
 
-from surfclass.errors import ConfigurationError, InputError
-from surfclass.light_position import (
+from calibration.light.highlight import (
     LightSearch,
     diffuse_term,
     locate_light,
@@ -13,6 +12,7 @@ from surfclass.light_position import (
     relative_spread,
     split_regions,
 )
+from surfclass.errors import ConfigurationError, InputError
 from surfclass.types import SurfaceView
 
 LIGHT = np.array([-0.084, 0.037, -0.006])

@@ -1,0 +1,1 @@
+"""The two cameras and how they stand to each other."""

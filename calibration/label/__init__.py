@@ -1,0 +1,1 @@
+"""Labelling of captures in a browser."""

@@ -1,0 +1,1 @@
+"""The light and how the surface's brightness follows from it."""

@@ -1,0 +1,1 @@
+"""Where texture can be trusted."""

@@ -1,0 +1,1 @@
+"""The colour camera's radiometric response."""
