@@ -1,0 +1,89 @@
+"""Calibration boards in images: which corners are seen, and where to a fraction of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.cameras.detection import find_checkerboard, grey_image, square_px, stretched
+from drivers.recordings.board import Board
+from surfclass.errors import ConfigurationError
+from surfclass.types import Float32, Float64
+
+__all__ = ["Board", "Found", "find_board"]
+
+_LEAST_CORNERS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The corners of a board that an image shows.
+
+    Attributes:
+        corners: (n, 2) float64 px, sub-pixel, in the image's grid.
+        ids: (n,) which rows of `Board.points_m` they are.
+    """
+
+    corners: Float64
+    ids: NDArray[np.int64]
+
+
+def find_board(image: NDArray[Any], board: Board, *, quick: bool = False) -> Found | None:
+    """Returns where the board's corners are, or None where it is not found.
+
+    A plain checkerboard is found whole or not at all. Its corners are in one order in any image where
+    the colours of its squares allow that (columns + rows odd); else the two ends may be swapped.
+
+    Args:
+        image: (h, w) or (h, w, 3) RGB, of any type; IR with speckle, too.
+        board: What to look for.
+        quick: For a live view: fewer attempts.
+
+    Raises:
+        InputError: For an image of another shape.
+        ConfigurationError: For a dictionary that the library does not know.
+    """
+    grey = grey_image(image)
+    if board.dictionary is not None and board.marker_m is not None:
+        return _find_charuco(grey, board, board.dictionary, board.marker_m)
+    size = board.columns, board.rows
+    rough = find_checkerboard(grey, size, quick=quick)
+    if rough is None:
+        return None
+    corners = _refined(grey, rough, square_px(rough, size))
+    return Found(corners, np.arange(len(corners)))
+
+
+def _refined(grey: Float32, rough: Float64, side_px: float) -> Float64:
+    reach = int(np.clip(round(0.4 * side_px), 2, 15))
+    root = np.sqrt(np.maximum(grey - grey.min(), 0))
+    smooth = stretched(cv2.GaussianBlur(root, (0, 0), np.clip(side_px / 16, 0.5, 1.5)))
+    corners = np.ascontiguousarray(rough, np.float32).reshape(-1, 1, 2)
+    ends = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
+    fine = cv2.cornerSubPix(smooth, corners, (reach, reach), (-1, -1), ends)
+    return np.asarray(fine, np.float64).reshape(-1, 2)
+
+
+def _find_charuco(grey: Float32, board: Board, dictionary: str, marker_m: float) -> Found | None:
+    number = getattr(cv2.aruco, dictionary, None)
+    if number is None:
+        known = ", ".join(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
+        raise ConfigurationError(f"board: dictionary {dictionary!r}, allowed: {known}")
+    markers = cv2.aruco.getPredefinedDictionary(number)
+    squares = (board.columns + 1, board.rows + 1)
+    image = stretched(grey)
+    best: Found | None = None
+    for legacy in (False, True):
+        pattern = cv2.aruco.CharucoBoard(squares, board.square_m, marker_m, markers)
+        pattern.setLegacyPattern(legacy)
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(image)
+        if ids is None or len(ids) < _LEAST_CORNERS:
+            continue
+        if best is None or len(ids) > len(best.ids):
+            places = np.asarray(corners, np.float64).reshape(-1, 2)
+            best = Found(places, np.asarray(ids, np.int64).reshape(-1))
+    return best
