@@ -17,7 +17,14 @@ from typing import Any, NoReturn, Self, TypeVar
 from drivers.aravis.control import ControlThread
 from drivers.aravis.library import Buffer, Camera, GenicamError
 from drivers.aravis.options import AravisOptions
-from drivers.aravis.session import Session, change_trigger, connect, restart
+from drivers.aravis.session import (
+    Session,
+    change_exposure,
+    change_trigger,
+    connect,
+    exposure_range_us,
+    restart,
+)
 from drivers.aravis.timing import Trigger
 from drivers.errors import (
     DeviceFaultError,
@@ -26,7 +33,7 @@ from drivers.errors import (
     DeviceTimeoutError,
 )
 from drivers.interfaces import Clock, ColourCamera
-from drivers.isolation.camera import IsolatedCamera
+from drivers.isolation.colour import IsolatedColourCamera
 from surfclass.errors import InputError
 from surfclass.frames import ColourFrame
 from surfclass.schema import validate
@@ -35,6 +42,7 @@ T = TypeVar("T")
 
 _OPEN_S = 12.0  # a search takes 1 s, a description of 1 MB over GigE several
 _WARM_UP_FRAMES, _WARM_UP_S = 3, 3.0
+_SETTING_S = 2.0
 _COMMAND_S = 0.3  # a camera that is there takes a command within milliseconds
 _SLICE_S = 0.05  # how long a loss goes unnoticed while a frame is waited for
 _log = logging.getLogger("surfclass.aravis")
@@ -47,7 +55,7 @@ def colour(*, name: str, clock: Clock, options: Mapping[str, Any], shared: dict[
         ConfigurationError: For options that are not `AravisOptions`.
     """
     checked = validate(AravisOptions, options, name)
-    return IsolatedCamera(
+    return IsolatedColourCamera(
         "drivers.colour_aravis:in_process", name=name, options=checked.model_dump(mode="json")
     )
 
@@ -142,7 +150,36 @@ class AravisCamera:
         session = self._opened()
         missing = max(0, session.count.missing - session.incomplete)
         status = f"{session.frames} frames, {session.incomplete} incomplete, {missing} missing"
-        return {**session.facts, "clock": session.exposures.clock.describe(), "status": status}
+        exposure = f"exposure {session.setup.exposure_s * 1e3:.3f} ms"
+        return {
+            **session.facts,
+            "settings": f"trigger {self._options.trigger}; {exposure}; {session.setup.facts}",
+            "clock": session.exposures.clock.describe(),
+            "status": status,
+        }
+
+    def exposure_range_s(self) -> tuple[float, float]:
+        """Returns the shortest and the longest exposure that the camera allows as it is set up.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+        shortest_us, longest_us = self._ask(partial(exposure_range_us, self._must_be_there()), self._soon())
+        return shortest_us / 1e6, longest_us / 1e6
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Sets the exposure time, and returns the one that the camera made of it.
+
+        Raises:
+            InputError: If it is outside the range (a ValueError).
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+        session = self._must_be_there()
+        if not 0 < exposure_s < math.inf:
+            raise InputError(f"{self._name}: exposure {exposure_s} s, allowed is above 0 and finite")
+        until_ns = self._soon(session.setup.exposure_s)
+        self._ask(partial(change_exposure, session, self._name, exposure_s * 1e6), until_ns)
+        return session.setup.exposure_s
 
     def grab(self, not_before_ns: int, timeout_s: float) -> ColourFrame:
         """Returns the first frame whose exposure certainly began at or after `not_before_ns`.
@@ -198,6 +235,10 @@ class AravisCamera:
             session.fresh = False
             began_ns, half_ns = session.exposures.began(buffer, *session.arrivals.of(buffer), trigger)
             return self._frame(session, buffer, began_ns, half_ns)
+
+    def _soon(self, more_s: float = 0.0) -> int:
+        """Until when a camera that is there does what needs a few commands, ns."""
+        return self._clock.now_ns() + round((_SETTING_S + more_s) * 1e9)
 
     def _send_trigger(self, camera: Camera, prompt: bool) -> Trigger:
         sent_ns = self._clock.now_ns()

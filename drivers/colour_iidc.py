@@ -12,14 +12,9 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers.bayer import demosaic
 from drivers.errors import (
     DeviceFaultError,
     DeviceLostError,
@@ -27,33 +22,42 @@ from drivers.errors import (
     DeviceTimeoutError,
     DriverUnavailableError,
 )
+from drivers.exposure import check_exposure
 from drivers.iidc.dc1394 import Camera, Dc1394Error, Library
 from drivers.iidc.dc1394_types import CAPTURE_FLAGS_DEFAULT, ISO_SPEED_400, LIBRARY, PACKAGE
-from drivers.iidc.features import Exposure, set_exposure, set_registers, set_strobe, set_trigger
+from drivers.iidc.features import (
+    Exposure,
+    change_exposure,
+    exposure_range_s,
+    set_exposure,
+    set_registers,
+    set_strobe,
+    set_trigger,
+)
+from drivers.iidc.finding import found
 from drivers.iidc.image_format import Format, set_format
 from drivers.iidc.options import IidcOptions, SetupError
 from drivers.iidc.stream import Arrival, IidcStream, StreamEndedError
 from drivers.interfaces import Clock
-from drivers.isolation.camera import IsolatedCamera
+from drivers.isolation.colour import IsolatedColourCamera
 from surfclass.errors import InputError
 from surfclass.frames import ColourFrame
 from surfclass.schema import validate
 
 _READY_POLL_S = 0.001
-_USB_DEVICES = Path("/sys/bus/usb/devices")
-_POINT_GREY_USB = "1e10"
+_STILL_S = 0.05  # besides exposure and read-out, until a camera that was stopped sends nothing more
 
 
 def colour(
     *, name: str, clock: Clock, options: Mapping[str, Any], shared: dict[str, Any]
-) -> IsolatedCamera[ColourFrame]:
+) -> IsolatedColourCamera:
     """An IIDC camera in a process of its own.
 
     Raises:
         ConfigurationError: For options that are none of IidcOptions'.
     """
     validate(IidcOptions, options, name)
-    return IsolatedCamera("drivers.colour_iidc:in_process", name=name, options=options)
+    return IsolatedColourCamera("drivers.colour_iidc:in_process", name=name, options=options)
 
 
 def in_process(*, name: str, clock: Clock, options: Mapping[str, Any], shared: dict[str, Any]) -> IidcCamera:
@@ -84,6 +88,7 @@ class IidcCamera:
         self._lost = ""
         self._due_ns: int | None = None  # until when the frame of a trigger that was given up may come
         self._seen_ready = False  # the camera, since its last trigger
+        self._since_ns = 0  # since when exposures are as long as they are now
         self._late = self._missing = self._unasked = 0
 
     @property
@@ -114,7 +119,7 @@ class IidcCamera:
                 self._name, f"{LIBRARY} cannot be loaded ({error}); install the Debian package {PACKAGE}"
             ) from error
         try:
-            self._camera = self._find(self._library)
+            self._camera = found(self._name, self._library, self._options.guid)
             self._start(self._camera)
         except BaseException as error:
             if isinstance(error, Dc1394Error) and error.means_gone:
@@ -172,7 +177,6 @@ class IidcCamera:
         """
         camera, stream = self._opened()
         assert self._format is not None
-        assert self._exposure is not None
         try:
             platform = camera.platform()
             device, bus = camera.pair("camera_get_node")
@@ -184,7 +188,7 @@ class IidcCamera:
             "serial": f"{camera.guid:016x}",
             "address": f"usb {bus:03d}:{device:03d}" if platform == "usb" else f"{platform} node {device}",
             "format": self._format.name,
-            "settings": f"{self._exposure.text}, trigger {self._options.trigger}",
+            "settings": f"{self._exposing}, trigger {self._options.trigger}",
             "clock": "the host's: the camera stamps nothing",
             "status": f"{stream.frames} frames, {stream.corrupt} corrupt, {self._late} too late, "
             f"{self._missing} missing, {self._unasked} not asked for",
@@ -209,6 +213,38 @@ class IidcCamera:
         except (StreamEndedError, Dc1394Error) as error:
             self._lose(str(error))
 
+    def exposure_range_s(self) -> tuple[float, float]:
+        """Returns the shortest and the longest exposure at this frame rate.
+
+        Raises:
+            DeviceLostError: If the camera does not answer.
+        """
+        camera, _ = self._opened()
+        try:
+            return exposure_range_s(camera, self._options, self._exposing)
+        except Dc1394Error as error:
+            self._lose(str(error))
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Sets the shutter, and returns the exposure time that the camera made of it.
+
+        Raises:
+            InputError: If it is outside the range (a ValueError).
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+        camera, stream = self._opened()
+        check_exposure(self._name, exposure_s, self.exposure_range_s())
+        try:
+            self._finish_exposures(camera, stream)
+            self._exposure = change_exposure(camera, self._options, self._exposing, exposure_s)
+            self._since_ns = self._clock.now_ns()
+            camera.call("video_set_transmission", 1)
+        except SetupError as error:
+            raise DeviceFaultError(self._name, str(error)) from error
+        except (StreamEndedError, Dc1394Error) as error:
+            self._lose(str(error))
+        return self._exposing.exposure_s
+
     def __enter__(self) -> Self:
         self.open()
         return self
@@ -217,18 +253,6 @@ class IidcCamera:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    def _find(self, library: Library) -> Camera:
-        guids = library.guids()
-        wanted = self._options.guid
-        there = ", ".join(f"{guid:016x}" for guid in guids)
-        if not guids:
-            raise DeviceNotFoundError(self._name, f"libdc1394 finds no camera{_hint()}")
-        if wanted is not None and int(wanted, 16) not in guids:
-            raise DeviceNotFoundError(self._name, f"no camera with guid {wanted}; there are: {there}")
-        if wanted is None and len(guids) > 1:
-            raise DeviceFaultError(self._name, f"there are several cameras; set guid to one of {there}")
-        return library.camera(guids[0] if wanted is None else int(wanted, 16))
 
     def _start(self, camera: Camera) -> None:
         options = self._options
@@ -297,29 +321,35 @@ class IidcCamera:
                 self._due_ns = self._clock.now_ns() + self._late_ns()
         return None
 
+    def _finish_exposures(self, camera: Camera, stream: IidcStream) -> None:
+        """Returns when no frame is on its way any more, and none will come by itself."""
+        if self._options.trigger == "software":
+            until_ns = self._clock.now_ns() + self._least_ns() + 2 * self._late_ns()
+            if self._due_frame(camera, stream, until_ns, "a frame is still under way") is not None:
+                self._late += 1
+            self._due_ns = None
+        else:
+            camera.call("video_set_transmission", 0)
+            readout_s = self._options.readout_max_s or self._exposing.period_s or 0.0
+            still_s = self._exposing.exposure_s + readout_s + _STILL_S
+            stream.rest_until(self._clock.now_ns() + round(still_s * 1e9))
+        self._unasked += stream.clear()
+
     def _running(self, stream: IidcStream, not_before_ns: int, deadline_ns: int) -> ColourFrame:
         """Waits for an exposure that the camera or a line begins."""
         while (arrival := stream.next(deadline_ns)) is not None:
-            if arrival.image is not None and self._earliest_ns(arrival) >= not_before_ns:
+            if arrival.image is not None and self._earliest_ns(arrival) >= max(not_before_ns, self._since_ns):
                 return self._frame(arrival, arrival.image, self._earliest_ns(arrival))
         raise DeviceTimeoutError(self._name, "no frame came in time")
 
     def _frame(self, arrival: Arrival, image: bytes, earliest_ns: int) -> ColourFrame:
         """The frame of an exposure that began at `earliest_ns` or later."""
-        form, exposure = self._format, self._exposure
+        form, exposure = self._format, self._exposing
         assert form is not None
-        assert exposure is not None
-        if len(image) != form.size_bytes:
-            raise DeviceFaultError(
-                self._name, f"an image of {len(image)} bytes came, {form.size_bytes} are in {form.name}"
-            )
-        raw: NDArray[np.uint8] | NDArray[np.uint16] = np.frombuffer(image, np.uint8)
-        if form.bits > 8:
-            raw = raw.view(">u2").astype(np.uint16)
         try:
-            rgb = demosaic(raw.reshape(form.height, form.width), form.pattern, form.bits)
+            rgb = form.decoded(image)
         except InputError as error:
-            raise DeviceFaultError(self._name, f"{error}; see the option bits") from error
+            raise DeviceFaultError(self._name, str(error)) from error
         if self._options.readout_max_s is not None:
             earliest_ns = max(earliest_ns, self._earliest_ns(arrival))
         latest_ns = arrival.at_ns - self._least_ns()
@@ -332,22 +362,24 @@ class IidcCamera:
             gain_db=exposure.gain_db,
         )
 
+    @property
+    def _exposing(self) -> Exposure:
+        assert self._exposure is not None  # it is open
+        return self._exposure
+
     def _late_ns(self) -> int:
         """How late the frame of a trigger may be."""
-        assert self._exposure is not None
-        return round((self._options.late_s + (self._exposure.period_s or 0.0)) * 1e9)
+        return round((self._options.late_s + (self._exposing.period_s or 0.0)) * 1e9)
 
     def _least_ns(self) -> int:
         """From an exposure's begin until its frame is here, at least."""
-        assert self._exposure is not None
-        return round((self._exposure.exposure_s + self._options.readout_min_s) * 1e9)
+        return round((self._exposing.exposure_s + self._options.readout_min_s) * 1e9)
 
     def _earliest_ns(self, arrival: Arrival) -> int:
         """When the exposure of a frame began at the earliest, by its arrival."""
-        assert self._exposure is not None
-        readout_s = self._options.readout_max_s or self._exposure.period_s
+        readout_s = self._options.readout_max_s or self._exposing.period_s
         assert readout_s is not None  # _start sees to it
-        return arrival.after_ns - round((readout_s + self._exposure.exposure_s) * 1e9)
+        return arrival.after_ns - round((readout_s + self._exposing.exposure_s) * 1e9)
 
     def _opened(self) -> tuple[Camera, IidcStream]:
         if self._lost:
@@ -364,16 +396,3 @@ class IidcCamera:
     def _before(self, deadline_ns: int, otherwise: str) -> None:
         if self._clock.now_ns() >= deadline_ns:
             raise DeviceTimeoutError(self._name, otherwise)
-
-
-def _hint() -> str:
-    """What keeps libdc1394 from a camera that the kernel sees."""
-    for device in _USB_DEVICES.glob("*/idVendor"):
-        with contextlib.suppress(OSError):  # unplugged this moment
-            if device.read_text().strip() == _POINT_GREY_USB:
-                return (
-                    ", though one of Point Grey's is on USB: it needs the udev rule "
-                    f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{_POINT_GREY_USB}", GROUP="video", MODE="0660" '
-                    "and this user in the group video; a USB 3 camera needs the aravis backend"
-                )
-    return ""

@@ -18,6 +18,7 @@ from drivers.errors import (
     DriverError,
     DriverUnavailableError,
 )
+from drivers.exposure import check_exposure
 from drivers.interfaces import Clock
 from drivers.v4l2 import pixels
 from drivers.v4l2.controls import Settings, Wanted
@@ -142,6 +143,30 @@ class V4l2ColourCamera:
             "status": f"{stream.delivered} frames" + (f"; {stream.tally}" if str(stream.tally) else ""),
         }
         return {key: value for key, value in told.items() if value}
+
+    def exposure_range_s(self) -> tuple[float, float]:
+        """Returns the shortest and the longest exposure; 0 and 0 where the camera does not tell it.
+
+        Raises:
+            DeviceLostError: If it is not open.
+        """
+        stream = self._must_be_open()
+        return stream.settings.exposure_range_s(stream.period_ns)
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Sets the exposure time, and returns it in V4L2's steps of 100 µs.
+
+        Raises:
+            InputError: If it is outside the range, or cannot be changed (a ValueError).
+            DeviceLostError, DeviceFaultError: As the class says.
+        """
+        stream = self._must_be_open()
+        check_exposure(self._name, exposure_s, self.exposure_range_s())
+        with self._as_driver_errors("setting its exposure"):
+            stream.change_exposure(exposure_s)
+        exposure_ns = stream.settings.exposure_ns
+        assert exposure_ns is not None  # it has the control
+        return exposure_ns / 1e9
 
     def __enter__(self) -> Self:
         self.open()

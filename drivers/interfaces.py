@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import Literal, Protocol, Self, runtime_checkable
 
 from surfclass.frames import ColourFrame, DepthFrame, JointState
 
@@ -79,6 +79,45 @@ class ColourCamera(Device, Protocol):
                 that is later).
             DeviceLostError, DeviceFaultError: As the class says.
         """
+
+
+@runtime_checkable
+class ExposureControl(Protocol):
+    """What a colour camera can do besides whose exposure time can be changed while it is open.
+
+    Ask for it by `exposure_control`. open() sets the configured exposure again.
+    """
+
+    def exposure_range_s(self) -> tuple[float, float]:
+        """Returns the shortest and the longest exposure; both the same where it cannot be changed.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Sets the exposure time, and returns the one that the camera made of it.
+
+        From then on `grab` gives no frame that was exposed with the one before, whatever time it is
+        asked for; frames have the new one in `exposure_s`.
+
+        Raises:
+            ValueError: If it is outside the range; nothing has changed then.
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says; which exposure
+                holds is not known then, until the camera is opened anew.
+        """
+
+
+def exposure_control(camera: ColourCamera) -> ExposureControl | None:
+    """Returns an open camera as one whose exposure can be changed, or None where it cannot.
+
+    Raises:
+        DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the camera does.
+    """
+    if not isinstance(camera, ExposureControl):
+        return None
+    shortest_s, longest_s = camera.exposure_range_s()
+    return camera if shortest_s < longest_s else None
 
 
 class DepthCamera(Device, Protocol):

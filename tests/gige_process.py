@@ -29,7 +29,7 @@ SERIAL = f"T{os.getpid()}"
 ADDRESS = os.environ.get("GIGE_TEST_ADDRESS", "127.0.0.1")
 _ROOT = Path(__file__).parents[1]
 _PATIENCE_S = 60.0
-_ARGUMENTS = ("--serial", SERIAL, "--address", ADDRESS, "--scale", "0.05")
+_ARGUMENTS = ("--serial", SERIAL, "--address", ADDRESS, "--scale", "0.05", "--light", "0.5")
 
 
 def missing() -> str:

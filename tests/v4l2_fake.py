@@ -157,6 +157,16 @@ class FakeNode:
         self.free = list(range(buffers))
         return buffers
 
+    def stop(self):
+        self.camera.step("stop")
+        assert not self.taken, "a buffer is still with the caller"
+        self.filled, self.free = [], []
+
+    def resume(self):
+        self.camera.step("resume")
+        self.begun_ns, self.next = self.camera.clock.ns, 0
+        self.free = list(range(4))
+
     def wait(self, timeout_s):
         self.camera.step("wait")
         clock = self.camera.clock

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from drivers.aravis.control import ControlThread
@@ -11,7 +11,7 @@ from drivers.aravis.features import Settings
 from drivers.aravis.library import Camera, GenicamError, Library, Stream
 from drivers.aravis.lines import set_trigger
 from drivers.aravis.options import AravisOptions
-from drivers.aravis.settings import Setup, set_up
+from drivers.aravis.settings import Setup, set_exposure, set_up
 from drivers.aravis.timing import Arrivals, Exposures, FrameCount
 from drivers.errors import DeviceNotFoundError
 from drivers.interfaces import Clock
@@ -69,22 +69,18 @@ def connect(name: str, options: AravisOptions, clock: Clock, control: ControlThr
         camera.set_packet_bytes(options.packet_bytes)
     setup = set_up(camera, options, name)
     stream = camera.stream(_BUFFERS)
-    control.look_after(
-        partial(_look, camera, setup.exposure_feature, setup.exposure_value),
-        partial(_release, camera, stream),
-    )
+    control.look_after(None, partial(_release, camera, stream))
     camera.execute("AcquisitionStart")
     width, height = setup.size
-    facts |= {
-        "format": f"{setup.format.name}, {width} × {height}",
-        "settings": f"trigger {options.trigger}; {setup.facts}",
-    }
+    facts |= {"format": f"{setup.format.name}, {width} × {height}"}
     exposures = Exposures(
         name, setup.exposure_s, options.stamp_at == "exposure_end", options.trigger_latency_s
     )
-    return Session(
+    session = Session(
         camera, stream, setup, exposures, Arrivals(clock.now_ns), FrameCount(), facts, setup.trigger
     )
+    control.look_after(partial(_look, session), partial(_release, camera, stream))
+    return session
 
 
 def restart(session: Session) -> None:
@@ -111,6 +107,34 @@ def change_trigger(session: Session, name: str, trigger: str) -> None:
         session.trigger = trigger
         set_trigger(Settings(session.camera, name), trigger)
         restart(session)
+
+
+def exposure_range_us(session: Session) -> tuple[float, float]:
+    """Returns the shortest and the longest exposure time.
+
+    Raises:
+        GenicamError: If it does not answer.
+    """
+    return session.camera.bounds(session.setup.exposure_feature)
+
+
+def change_exposure(session: Session, name: str, exposure_us: float) -> None:
+    """Has all exposures last so long from now on; the camera stands still for it.
+
+    While it runs, an exposure with the old time may be under way or have its time set already.
+
+    Raises:
+        ConfigurationError, DeviceFaultError, GenicamError: As `aravis_settings.set_up`. The camera is
+            left standing where it does not take the time.
+    """
+    setup, settings = session.setup, Settings(session.camera, name)
+    settings.within("exposure_us", setup.exposure_feature, exposure_us)  # before it is stopped for nothing
+    session.camera.execute("AcquisitionStop")
+    session.camera.write(setup.exposure_feature, exposure_us)  # also a value that is close to the last
+    took_us = set_exposure(settings, setup.exposure_feature, exposure_us)
+    session.setup = replace(setup, exposure_value=took_us)
+    session.exposures.last(session.setup.exposure_s)
+    restart(session)
 
 
 def _found(name: str, wanted: str | None, library: Library) -> str:
@@ -152,9 +176,10 @@ def _facts(camera: Camera, version: str, address: str | None) -> dict[str, str]:
     return {key: value for key, value in facts.items() if value}
 
 
-def _look(camera: Camera, feature: str, wanted: float) -> str:
+def _look(session: Session) -> str:
     """Asks the camera for its exposure time; a camera that was reset has another."""
-    got = camera.read(feature)
+    feature, wanted = session.setup.exposure_feature, session.setup.exposure_value
+    got = session.camera.read(feature)
     return "" if got == wanted else f"it was reset: {feature} reads {got}, was set to {wanted}"
 
 

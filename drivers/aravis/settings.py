@@ -47,21 +47,24 @@ class Setup:
     Attributes:
         format: Of the pixels.
         size: Width and height.
-        exposure_s: Exposure time.
-        exposure_feature: Where that was read, and its `exposure_value` there.
+        exposure_feature: Where the exposure time was read, and its `exposure_value` there, µs.
         gain_db: None where the camera does not tell it in dB.
-        facts: The settings in words, but for the trigger.
+        facts: The settings in words, but for trigger and exposure.
         trigger: What begins an exposure now: the camera's software trigger wherever it has one.
     """
 
     format: Format
     size: tuple[int, int]
-    exposure_s: float
     exposure_feature: str
     exposure_value: float
     gain_db: float | None
     facts: str
     trigger: str
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time."""
+        return self.exposure_value / 1e6
 
 
 def set_up(camera: Camera, options: AravisOptions, device: str) -> Setup:
@@ -87,10 +90,7 @@ def set_up(camera: Camera, options: AravisOptions, device: str) -> Setup:
     size = _set_region(settings, options.region, pixel_format)
     facts = [_set_rate(settings, options.rate_hz if options.trigger == "free" else None)]
     exposure_feature = settings.need("exposure_us", *_EXPOSURES)
-    settings.within("exposure_us", exposure_feature, options.exposure_us)
-    relative, absolute = _EXPOSURE_TOLERANCE
-    tolerance = max(relative * options.exposure_us, absolute)
-    exposure = float(settings.make(exposure_feature, options.exposure_us, tolerance))
+    exposure_us = set_exposure(settings, exposure_feature, options.exposure_us)
     gain_db = _set_gain(settings, options.gain_db)
     facts += [_set_white_balance(settings, options), _black_level(camera)]
     facts += [set_strobe(settings, line, options) for line in options.strobe_lines]
@@ -100,8 +100,19 @@ def set_up(camera: Camera, options: AravisOptions, device: str) -> Setup:
     set_trigger(settings, first)
     settings.look_again()
     gain = "gain in the camera's own steps" if gain_db is None else f"gain {gain_db:.2f} dB"
-    described = "; ".join(fact for fact in [f"exposure {exposure / 1e3:.3f} ms", gain, *facts] if fact)
-    return Setup(pixel_format, size, exposure / 1e6, exposure_feature, exposure, gain_db, described, first)
+    described = "; ".join(fact for fact in [gain, *facts] if fact)
+    return Setup(pixel_format, size, exposure_feature, exposure_us, gain_db, described, first)
+
+
+def set_exposure(settings: Settings, feature: str, exposure_us: float) -> float:
+    """Sets the exposure time and returns what the camera made of it, µs.
+
+    Raises:
+        ConfigurationError, DeviceFaultError, GenicamError: As `set_up`.
+    """
+    settings.within("exposure_us", feature, exposure_us)
+    relative, absolute = _EXPOSURE_TOLERANCE
+    return float(settings.make(feature, exposure_us, max(relative * exposure_us, absolute)))
 
 
 def _choose_format(settings: Settings, name: str | None) -> Format:

@@ -62,10 +62,15 @@ class Exposures:
     def __init__(
         self, device: str, exposure_s: float, stamped_at_end: bool, trigger_latency_s: float
     ) -> None:
-        self._device, self._exposure_ns = device, round(exposure_s * 1e9)
-        self._stamp_after_ns = self._exposure_ns if stamped_at_end else 0
+        self._device, self._stamped_at_end = device, stamped_at_end
         self._latency_ns = round(trigger_latency_s * 1e9)
         self.clock = DeviceClock(1e-9)
+        self.last(exposure_s)
+
+    def last(self, exposure_s: float) -> None:
+        """From the next frame on exposures last so long."""
+        self._exposure_ns = round(exposure_s * 1e9)
+        self._stamp_after_ns = self._exposure_ns if self._stamped_at_end else 0
 
     def is_from_before(self, buffer: Buffer, t_ns: int) -> bool:
         """Whether a frame certainly began before `t_ns`, as far as the device's clock is known yet."""

@@ -294,9 +294,11 @@ def main() -> None:
     parser.add_argument("--scene", default="grey_card")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument("--light", type=float, default=0.0, help="level of the LED, 0 to 1")
     given = parser.parse_args()
     logging.basicConfig(stream=sys.stderr)
     cell = host_cell(given.scene, given.seed, scale=given.scale)
+    cell.set_light(given.light, time.monotonic_ns())
     cell.bake()
     with GigeCamera(cell, given.serial, given.address) as camera:
         print("ready", flush=True)

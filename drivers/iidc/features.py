@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ctypes import byref, c_uint32
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.iidc.dc1394 import Camera
 from drivers.iidc.dc1394_types import (
@@ -47,13 +47,18 @@ class Exposure:
         exposure_s: By its absolute shutter, or by the register and the options.
         gain_db: The same; None where neither tells.
         period_s: From one frame to the next; None where it is not known.
-        text: For people.
+        shutter: The shutter for people.
+        rest: All else for people.
     """
 
     exposure_s: float
     gain_db: float | None
     period_s: float | None
-    text: str
+    shutter: str
+    rest: str
+
+    def __str__(self) -> str:
+        return f"{self.shutter}, {self.rest}"
 
 
 def set_exposure(camera: Camera, options: IidcOptions) -> Exposure:
@@ -66,12 +71,8 @@ def set_exposure(camera: Camera, options: IidcOptions) -> Exposure:
     infos = {feature: info for feature in _MANUAL if (info := _manual(camera, feature)) is not None}
     period_s = _set_frame_rate(camera, infos.get(Feature.FRAME_RATE), options)
     wanted_s = None if options.exposure_us is None else options.exposure_us / 1e6
-    step_s = None if options.shutter_step_us is None else options.shutter_step_us / 1e6
-    exposure_s, shutter = _set_value(
-        camera,
-        infos.get(Feature.SHUTTER),
-        _Wanted("exposure_us", wanted_s, "shutter_raw", options.shutter_raw, 1e6, 50e-6),
-        _Steps("shutter_step_us", step_s, options.shutter_offset_us / 1e6),
+    exposure_s, shutter = _set_shutter(
+        camera, infos.get(Feature.SHUTTER), options, wanted_s, options.shutter_raw
     )
     gain_db, gain = _set_value(
         camera,
@@ -81,12 +82,7 @@ def set_exposure(camera: Camera, options: IidcOptions) -> Exposure:
     )
     if options.brightness_raw is not None:
         _set_raw(camera, infos.get(Feature.BRIGHTNESS), "brightness_raw", options.brightness_raw)
-    if exposure_s is None:
-        raise SetupError("the camera has no absolute shutter; give shutter_step_us from its manual")
-    if exposure_s <= 0:
-        raise SetupError(f"exposure {exposure_s} s by {shutter} and shutter_step_us, allowed is above 0")
     parts = [
-        f"shutter {exposure_s * 1e3:.3f} ms ({shutter})",
         "gain " + (f"{gain_db:.2f} dB ({gain})" if gain_db is not None else gain),
         *([f"{1 / period_s:.3g} Hz"] if period_s is not None else []),
         *(
@@ -95,7 +91,53 @@ def set_exposure(camera: Camera, options: IidcOptions) -> Exposure:
             if feature in _OFF
         ),
     ]
-    return Exposure(exposure_s, gain_db, period_s, ", ".join(parts))
+    return Exposure(exposure_s, gain_db, period_s, shutter, ", ".join(parts))
+
+
+def exposure_range_s(camera: Camera, options: IidcOptions, now: Exposure) -> tuple[float, float]:
+    """Returns the shortest and the longest exposure; both that of now where it cannot be changed.
+
+    Raises:
+        Dc1394Error: If it does not answer.
+    """
+    info = camera.feature(Feature.SHUTTER)
+    if info.absolute_capable:
+        return float(info.abs_min), float(info.abs_max)
+    if options.shutter_step_us is None:
+        return now.exposure_s, now.exposure_s
+    step_us, offset_us = options.shutter_step_us, options.shutter_offset_us
+    shortest_us, longest_us = (raw * step_us + offset_us for raw in (info.min, info.max))
+    return max(shortest_us, step_us) / 1e6, longest_us / 1e6
+
+
+def change_exposure(camera: Camera, options: IidcOptions, now: Exposure, exposure_s: float) -> Exposure:
+    """Sets the shutter alone, and returns what the camera does then.
+
+    Raises:
+        SetupError: If the camera does not keep it.
+        Dc1394Error: If it does not answer.
+    """
+    info = camera.feature(Feature.SHUTTER)
+    took_s, shutter = _set_shutter(camera, info, options, exposure_s, None)
+    return replace(now, exposure_s=took_s, shutter=shutter)
+
+
+def _set_shutter(
+    camera: Camera, info: FeatureInfo | None, options: IidcOptions, exposure_s: float | None, raw: int | None
+) -> tuple[float, str]:
+    """Sets the exposure time or the register; returns the time, and the shutter for people."""
+    step_s = None if options.shutter_step_us is None else options.shutter_step_us / 1e6
+    took_s, register = _set_value(
+        camera,
+        info,
+        _Wanted("exposure_us", exposure_s, "shutter_raw", raw, 1e6, 50e-6),
+        _Steps("shutter_step_us", step_s, options.shutter_offset_us / 1e6),
+    )
+    if took_s is None:
+        raise SetupError("the camera has no absolute shutter; give shutter_step_us from its manual")
+    if took_s <= 0:
+        raise SetupError(f"exposure {took_s} s by {register} and shutter_step_us, allowed is above 0")
+    return took_s, f"shutter {took_s * 1e3:.3f} ms ({register})"
 
 
 def set_trigger(camera: Camera, options: IidcOptions) -> None:

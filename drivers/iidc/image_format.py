@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.bayer import PATTERNS, Pattern
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.bayer import PATTERNS, Pattern, demosaic
 from drivers.iidc.dc1394 import Camera, Dc1394Error
 from drivers.iidc.dc1394_types import (
     COLOUR_FILTERS,
@@ -18,6 +21,7 @@ from drivers.iidc.dc1394_types import (
     VideoModes,
 )
 from drivers.iidc.options import IidcOptions, SetupError
+from surfclass.errors import InputError
 
 POINT_GREY = 0x00B09D  # its OUI, the vendor id of its cameras
 
@@ -49,6 +53,22 @@ class Format:
     def size_bytes(self) -> int:
         """Of an image."""
         return self.width * self.height * (1 if self.bits == 8 else 2)
+
+    def decoded(self, image: bytes) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """Returns the (h, w, 3) image that these bytes are.
+
+        Raises:
+            InputError: If there are too few or too many, or values fill other bits than they should.
+        """
+        if len(image) != self.size_bytes:
+            raise InputError(f"an image of {len(image)} bytes came, {self.size_bytes} are in {self.name}")
+        raw: NDArray[np.uint8] | NDArray[np.uint16] = np.frombuffer(image, np.uint8)
+        if self.bits > 8:
+            raw = raw.view(">u2").astype(np.uint16)
+        try:
+            return demosaic(raw.reshape(self.height, self.width), self.pattern, self.bits)
+        except InputError as error:
+            raise InputError(f"{error}; see the option bits") from error
 
 
 def set_format(camera: Camera, options: IidcOptions) -> Format:

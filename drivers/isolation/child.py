@@ -1,7 +1,7 @@
 """The process in which an isolated device lives; only `drivers.isolation.child_process` starts it.
 
-It answers one question at a time: open, grab, check, about, close. Imports come late, so that it is
-bound to its parent's life before anything that takes long.
+It answers one question at a time: open, grab, exposure_range, set_exposure, check, about, close. Imports
+come late, so that it is bound to its parent's life before anything that takes long.
 """
 
 from __future__ import annotations
@@ -48,6 +48,10 @@ class DeviceServer:
                     self._open(question["factory"], question["options"])
                 case "grab":
                     return self._grab(question["not_before_ns"], question["timeout_s"], question["with_ir"])
+                case "exposure_range":
+                    return {"range_s": self._exposure_range_s()}
+                case "set_exposure":
+                    return {"exposure_s": self._device.set_exposure(question["exposure_s"])}
                 case "check":
                     self._device.check()
                 case "about":
@@ -79,6 +83,12 @@ class DeviceServer:
             raise DriverUnavailableError(
                 self._name, f"{module} needs the library {error.name!r}; install the package that has it"
             ) from error
+
+    def _exposure_range_s(self) -> tuple[float, float]:
+        from drivers.interfaces import ExposureControl
+
+        device = self._device
+        return device.exposure_range_s() if isinstance(device, ExposureControl) else (0.0, 0.0)
 
     def _grab(self, not_before_ns: int, timeout_s: float, with_ir: bool) -> dict[str, Any]:
         from drivers.errors import DeviceFaultError

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Literal, Self
 
 from drivers.errors import DeviceFaultError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from drivers.exposure import check_exposure
 from drivers.sim.faults import DeviceName
 from drivers.sim.randomness import stream
 from drivers.sim.world import SimWorld
@@ -20,6 +21,8 @@ DEPTH_EXPOSURE_NS = 10_000_000
 DEPTH_READOUT_NS = 25_000_000
 LIGHT_SETTLE_NS = 5_000_000
 JOINT_READ_NS = 2_000_000
+EXPOSURE_STEP_S = 10e-6  # a row of the sensor
+SHORTEST_EXPOSURE_S, LONGEST_EXPOSURE_S = 50e-6, 0.5
 
 
 class SimDevice:
@@ -102,13 +105,41 @@ def _allowed_wait_ns(timeout_s: float) -> int:
 
 
 class SimColourCamera(SimDevice):
-    """A colour camera that triggers inside `grab`."""
+    """A colour camera that triggers inside `grab`, and whose exposure can be changed."""
 
     kind = "colour"
 
     def __init__(self, world: SimWorld) -> None:
         super().__init__(world)
         self._frames = 0
+        self._exposure_s = world.exposure_s
+
+    def open(self) -> None:
+        """Finds the camera and sets the world's exposure time."""
+        super().open()
+        self._exposure_s = self.world.exposure_s
+
+    def exposure_range_s(self) -> tuple[float, float]:
+        """Returns the shortest and the longest exposure.
+
+        Raises:
+            DeviceLostError, DeviceFaultError: As the world's faults say.
+        """
+        self._must_answer(self.world.clock.now_ns())
+        return SHORTEST_EXPOSURE_S, LONGEST_EXPOSURE_S
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Sets the exposure time, and returns it as a whole number of rows.
+
+        Raises:
+            InputError: If it is outside the range (a ValueError).
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the world's faults say.
+        """
+        check_exposure(self.name, exposure_s, self.exposure_range_s())
+        now_ns = self.world.clock.now_ns()
+        self._waits_for(now_ns, now_ns + 100_000_000, "reply")
+        self._exposure_s = round(exposure_s / EXPOSURE_STEP_S) * EXPOSURE_STEP_S
+        return self._exposure_s
 
     def grab(self, not_before_ns: int, timeout_s: float) -> ColourFrame:
         """Returns a frame whose exposure began at or after `not_before_ns`.
@@ -122,7 +153,7 @@ class SimColourCamera(SimDevice):
         self._must_answer(now_ns)
         start_ns = max(not_before_ns, now_ns)
         deadline_ns = start_ns + _allowed_wait_ns(timeout_s)
-        exposure_ns = round(world.exposure_s * 1e9)
+        exposure_ns = round(self._exposure_s * 1e9)
         begin_ns = start_ns + TRIGGER_LATENCY_NS
         while True:
             self._frames += 1
@@ -140,9 +171,9 @@ class SimColourCamera(SimDevice):
         self._waits_for(there_ns, deadline_ns, "frame")
         level = world.light_level(begin_ns, end_ns)
         mid_ns = (begin_ns + end_ns) // 2
-        image = world.render_colour(world.joints(mid_ns), level, self._frames)
+        image = world.render_colour(world.joints(mid_ns), level, self._frames, self._exposure_s)
         world.exposed(begin_ns, end_ns, level)
-        return ColourFrame(mid_ns, self._frames, world.exposure_s, image)
+        return ColourFrame(mid_ns, self._frames, self._exposure_s, image)
 
 
 class SimDepthCamera(SimDevice):

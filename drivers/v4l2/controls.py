@@ -89,6 +89,33 @@ class Settings:
             return None
         return round(self.held[self._exposure] * _EXPOSURE_UNIT_US * 1e3)
 
+    def exposure_range_s(self, period_ns: int) -> tuple[float, float]:
+        """Returns the shortest and the longest exposure that fits into a frame's period.
+
+        Both are that of now where it cannot be changed, and 0 where the camera does not tell it.
+        """
+        control, now_s = self._exposure, (self.exposure_ns or 0) / 1e9
+        if control is None or not control.writable:
+            return now_s, now_s
+        step = max(1, control.step)
+        most = min(control.maximum, int(period_ns / (_EXPOSURE_UNIT_US * 1e3)))
+        most = control.minimum + max(0, most - control.minimum) // step * step
+        low, high = (units * _EXPOSURE_UNIT_US / 1e6 for units in (max(step, control.minimum), most))
+        return low, max(low, high)
+
+    def set_exposure(self, exposure_s: float) -> None:
+        """Sets the exposure to the step nearest to a value within the range.
+
+        Raises:
+            DeviceFaultError: If it refuses the value, or has another one afterwards.
+            OSError: As the node does.
+        """
+        control = self._must("exposure_us", self._exposure)
+        step = max(1, control.step)
+        steps = round((exposure_s * 1e6 / _EXPOSURE_UNIT_US - control.minimum) / step)
+        self._set(control, control.minimum + steps * step)
+        self.verify()
+
     @property
     def gain(self) -> int | None:
         """The gain in force, in the driver's own unit; None where the camera has no such control."""

@@ -201,6 +201,16 @@ class VideoNode:
         self._v4l2.stream_on(self._fd, self._type)
         return int(count)
 
+    def stop(self) -> None:
+        """Stops the stream; buffers lose what they hold, and none may be with the caller."""
+        self._v4l2.stream_off(self._fd, self._type)
+
+    def resume(self) -> None:
+        """Gives all buffers to the driver anew and starts the stopped stream."""
+        for index in range(len(self._maps)):
+            self._v4l2.enqueue_buffer(self._fd, self._type, self._memory, 0, index)
+        self._v4l2.stream_on(self._fd, self._type)
+
     def wait(self, timeout_s: float) -> bool:
         """Returns whether `take` has something to say within the timeout: a buffer or an error."""
         return bool(self._poll.poll(max(0.0, timeout_s) * 1e3))

@@ -63,6 +63,18 @@ class Stream:
     _counter: int | None = None
     _fresh: bool = False
 
+    def change_exposure(self, exposure_s: float) -> None:
+        """Sets the exposure while the stream stands, so that no frame of before is left or under way.
+
+        Raises:
+            DeviceFaultError: If it does not take it; the stream stands still then.
+            OSError: As the node does.
+        """
+        self.node.stop()
+        self.settings.set_exposure(exposure_s)
+        self._fresh = False  # the driver's count may start again
+        self.node.resume()
+
     def judge(self, filled: Filled, fresh: bool, seen_ns: int, not_before_ns: int) -> times.Exposure | None:
         """Returns when a buffer was exposed, or counts why it is no frame to deliver and returns None.
 

@@ -24,8 +24,7 @@ from bench import Backend, Bench, Trouble
 from drivers.clock import SystemClock
 from drivers.colour_iidc import in_process
 from drivers.interfaces import ColourCamera
-from drivers.isolation.camera import IsolatedCamera
-from surfclass.frames import ColourFrame
+from drivers.isolation.colour import IsolatedColourCamera
 
 OPTIONS = {
     "mode": "format7_0",
@@ -81,7 +80,7 @@ def on_a_socket(folder: Path) -> Iterator[Bench]:
         def faults(changed: dict[str, Any]) -> None:
             firefly.camera.faults = Faults(**changed)
 
-        camera: IsolatedCamera[ColourFrame] = IsolatedCamera(
+        camera = IsolatedColourCamera(
             "drivers.colour_iidc:in_process", name="colour", options=OPTIONS, environment=environment
         )
         yield bench(camera, 0.4, firefly.plug, firefly.unplug, faults)

@@ -12,7 +12,8 @@ from bench import Backend, Bench, Trouble
 
 from drivers.clock import SystemClock
 from drivers.isolation.camera import IsolatedCamera
-from surfclass.frames import ColourFrame, DepthFrame
+from drivers.isolation.colour import IsolatedColourCamera
+from surfclass.frames import DepthFrame
 
 HERE = Path(__file__).parent
 FAULTS: dict[Trouble, str] = {
@@ -33,7 +34,7 @@ def isolated(folder: Path) -> Iterator[Bench]:
         return {"fault_path": str(paths[kind])}
 
     there = {"PYTHONPATH": str(HERE)}
-    colour: IsolatedCamera[ColourFrame] = IsolatedCamera(
+    colour = IsolatedColourCamera(
         "isolated_sim:colour", name="colour", options=options("colour"), environment=there
     )
     depth: IsolatedCamera[DepthFrame] = IsolatedCamera(

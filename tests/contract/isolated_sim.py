@@ -21,7 +21,7 @@ class ToldWorld(SimWorld):
 
     def __init__(self, kind: str, path: str) -> None:
         self._kind, self._path = kind, Path(path)
-        super().__init__("grey_card", seed=1, clock=SimClock(of_host=True), scale=0.05)
+        super().__init__("grey_card", seed=1, clock=SimClock(of_host=True), scale=0.05, ambient=0.2)
 
     def fault(self, device: Any, kind: Any, t_ns: int | None = None) -> Fault | None:
         told = self._path.read_text()

@@ -14,6 +14,7 @@ from drivers.errors import (
     DeviceTimeoutError,
     DriverError,
 )
+from drivers.interfaces import exposure_control
 
 KINDS = ("colour", "depth", "light", "arm")
 CAMERAS = ("colour", "depth")
@@ -264,6 +265,93 @@ class TestColourCamera:
         assert first.dtype in (np.uint8, np.uint16)
         with pytest.raises(ValueError, match="read-only"):
             first[0, 0, 0] = 1
+
+
+@pytest.fixture
+def exposing(bench):
+    """The open camera with its light on, if its exposure can be changed, and the exposure as configured."""
+    with contextlib.ExitStack() as stack:
+        camera = stack.enter_context(bench.device("colour"))
+        control = exposure_control(camera)
+        if control is None:
+            pytest.skip("this camera's exposure cannot be changed")
+        lit_ns = bench.clock.now_ns()
+        if bench.light is not None:
+            lit_ns = stack.enter_context(bench.light).set_level(0.5)
+        yield control, camera.grab(lit_ns, PATIENT_S).exposure_s
+
+
+@pytest.mark.kinds("colour")
+class TestExposureControl:
+    def brightness(self, bench):
+        return float(bench.device("colour").grab(bench.clock.now_ns(), PATIENT_S).rgb.mean())
+
+    def test_images_are_as_bright_as_their_exposure_is_long(self, bench, exposing):
+        control, configured_s = exposing
+        seen = []
+        for factor in (0.5, 1.0, 2.0):
+            took_s = control.set_exposure(factor * configured_s)
+            assert took_s == pytest.approx(factor * configured_s, rel=0.06, abs=50e-6)
+            frame = bench.device("colour").grab(bench.clock.now_ns(), PATIENT_S)
+            assert frame.exposure_s == took_s
+            seen.append(float(frame.rgb.mean()))
+        assert seen[1] > 1.15 * seen[0]
+        assert seen[2] > 1.15 * seen[1]
+
+    def test_no_frame_of_the_exposure_before_comes_whatever_time_is_asked_for(self, bench, exposing):
+        control, configured_s = exposing
+        began_ns = bench.clock.now_ns()
+        for factor in (2.0, 0.5, 2.0):
+            took_s = control.set_exposure(factor * configured_s)
+            frame = bench.device("colour").grab(began_ns, PATIENT_S)
+            assert frame.exposure_s == took_s
+            assert float(frame.rgb.mean()) == pytest.approx(self.brightness(bench), rel=0.05)
+
+    def test_it_can_be_set_after_a_frame_was_given_up(self, bench, exposing):
+        control, configured_s = exposing
+        with pytest.raises(DeviceTimeoutError):
+            bench.device("colour").grab(bench.clock.now_ns(), 0.0005)
+        took_s = control.set_exposure(2.0 * configured_s)
+        frame = bench.device("colour").grab(bench.clock.now_ns(), PATIENT_S)
+        assert frame.exposure_s == took_s
+        assert float(frame.rgb.mean()) == pytest.approx(self.brightness(bench), rel=0.05)
+
+    def test_a_small_change_is_made_too(self, bench, exposing):
+        control, configured_s = exposing
+        steps = {control.set_exposure(configured_s * (1 + 0.004 * n)) for n in range(60)}
+        assert len(steps) > 1
+        assert max(steps) > 1.1 * configured_s
+
+    def test_both_ends_of_the_range_can_be_set(self, exposing):
+        control, configured_s = exposing
+        low_s, high_s = control.exposure_range_s()
+        assert low_s <= configured_s <= high_s
+        for end_s in (low_s, high_s):
+            assert control.set_exposure(end_s) == pytest.approx(end_s, rel=0.06, abs=50e-6)
+
+    def test_an_exposure_outside_the_range_is_refused_and_changes_nothing(self, bench, exposing):
+        control, configured_s = exposing
+        low_s, high_s = control.exposure_range_s()
+        for wrong_s in (0.9 * low_s, 1.1 * high_s, 0.0, -1.0, float("nan"), float("inf")):
+            with pytest.raises(ValueError, match=r"allow"):
+                control.set_exposure(wrong_s)
+        assert bench.device("colour").grab(bench.clock.now_ns(), PATIENT_S).exposure_s == configured_s
+
+    def test_opening_sets_the_configured_exposure_again(self, bench, exposing):
+        control, configured_s = exposing
+        control.set_exposure(2.0 * configured_s)
+        camera = bench.device("colour")
+        camera.close()
+        camera.open()
+        assert camera.grab(bench.clock.now_ns(), PATIENT_S).exposure_s == configured_s
+
+    def test_a_closed_camera_refuses_with_a_driver_error(self, bench, exposing):
+        control, configured_s = exposing
+        bench.device("colour").close()
+        with pytest.raises(DriverError):
+            control.set_exposure(configured_s)
+        with pytest.raises(DriverError):
+            control.exposure_range_s()
 
 
 @pytest.mark.kinds("depth")
