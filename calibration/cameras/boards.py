@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.detection import find_checkerboard, grey_image, square_px, stretched
+from calibration.cameras.detection import find_checkerboard, grey_image, stretched
+from calibration.cameras.refinement import refine
 from drivers.recordings.board import Board
 from surfclass.errors import ConfigurationError
 from surfclass.types import Float32, Float64
@@ -17,6 +18,7 @@ from surfclass.types import Float32, Float64
 __all__ = ["Board", "Found", "find_board"]
 
 _LEAST_CORNERS = 6
+_LEAST_PLACED = 0.5  # of a checkerboard's corners
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,18 +56,11 @@ def find_board(image: NDArray[Any], board: Board, *, quick: bool = False) -> Fou
     rough = find_checkerboard(grey, size, quick=quick)
     if rough is None:
         return None
-    corners = _refined(grey, rough, square_px(rough, size))
-    return Found(corners, np.arange(len(corners)))
-
-
-def _refined(grey: Float32, rough: Float64, side_px: float) -> Float64:
-    reach = int(np.clip(round(0.4 * side_px), 2, 15))
-    root = np.sqrt(np.maximum(grey - grey.min(), 0))
-    smooth = stretched(cv2.GaussianBlur(root, (0, 0), np.clip(side_px / 16, 0.5, 1.5)))
-    corners = np.ascontiguousarray(rough, np.float32).reshape(-1, 1, 2)
-    ends = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
-    fine = cv2.cornerSubPix(smooth, corners, (reach, reach), (-1, -1), ends)
-    return np.asarray(fine, np.float64).reshape(-1, 2)
+    corners = refine(grey, rough, size)
+    placed = np.isfinite(corners[:, 0])
+    if placed.mean() < _LEAST_PLACED:
+        return None
+    return Found(corners[placed], np.flatnonzero(placed))
 
 
 def _find_charuco(grey: Float32, board: Board, dictionary: str, marker_m: float) -> Found | None:
