@@ -63,6 +63,19 @@ def find_board(image: NDArray[Any], board: Board, *, quick: bool = False) -> Fou
     return Found(corners[placed], np.flatnonzero(placed))
 
 
+def symmetries(board: Board) -> list[NDArray[np.int64]]:
+    """Returns the orders in which a board's corners may be found, (n,) indices each; the first as they are.
+
+    A checkerboard looks the same from its other end where columns + rows is even, and from all four
+    sides where both are the same even number; a ChArUco board says which corner is which.
+    """
+    grid = np.arange(board.columns * board.rows).reshape(board.rows, board.columns)
+    quarters = [0]
+    if board.kind == "checkerboard" and (board.columns + board.rows) % 2 == 0:
+        quarters = [0, 1, 2, 3] if board.columns == board.rows and board.columns % 2 == 0 else [0, 2]
+    return [np.rot90(grid, quarter).reshape(-1).astype(np.int64) for quarter in quarters]
+
+
 def _find_charuco(grey: Float32, board: Board, dictionary: str, marker_m: float) -> Found | None:
     number = getattr(cv2.aruco, dictionary, None)
     if number is None:

@@ -102,6 +102,8 @@ def in_order(places: Float64, size: tuple[int, int], grey: Float32) -> Float64:
         grid = grid[:, ::-1]
     if (columns + rows) % 2 and _first_is_light(grid, grey):
         grid = grid[::-1, ::-1]
+    elif columns == rows and columns % 2 and _first_is_light(grid, grey):
+        grid = np.rot90(grid)
     return np.ascontiguousarray(grid.reshape(-1, 2))
 
 
