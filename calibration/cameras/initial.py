@@ -93,8 +93,7 @@ def _zhang(observations: Observations) -> Float64:
         focal = 1 / np.sqrt(inverse_square)
         if not ((focal > _SANE[0] * width) & (focal < _SANE[1] * width)).all():
             focal = np.full(2, float(width))
-    parameters: Float64 = np.concatenate([focal, centre, np.zeros(_P - 4)]).astype(np.float64)
-    return parameters
+    return np.array([*focal, *centre, *np.zeros(_P - 4)])
 
 
 def joined(
@@ -146,8 +145,8 @@ def _renumbered(board: Board, order: NDArray[np.int64]) -> Float64:
     u, v = new[ends[1]] - new[ends[0]], new[ends[2]] - new[ends[0]]
     turn = np.column_stack([u, v, np.cross(u, v)]) @ np.linalg.inv(np.column_stack([x, y, np.cross(x, y)]))
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn, new[0] - turn @ old[0]
-    return np.linalg.inv(matrix)
+    matrix[:3, :3], matrix[:3, 3] = turn.T, old[0] - turn.T @ new[0]
+    return matrix
 
 
 def _consensus(relations: Float64) -> tuple[list[int], Float64]:
