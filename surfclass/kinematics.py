@@ -53,6 +53,24 @@ def forward_kinematics(q: Float64, flange_offset_m: float = 0.084) -> Transform:
     return Transform("base", "flange", data.oMf[flange].homogeneous)
 
 
+def flange_jacobian(q: Float64, flange_offset_m: float = 0.084) -> Float64:
+    """Returns how the flange moves with each joint: (6, 6), a column for each joint.
+
+    Rows 0–2 are the turn (rad per rad), rows 3–5 the shift (m per rad), both in the flange's own frame.
+
+    Args:
+        q: (6,) joint angles, rad.
+        flange_offset_m: The last D-H length.
+    """
+    import pinocchio
+
+    model, flange = _model(float(flange_offset_m))
+    data = model.createData()
+    local = pinocchio.ReferenceFrame.LOCAL
+    shift_first = pinocchio.computeFrameJacobian(model, data, np.asarray(q, np.float64), flange, local)
+    return np.concatenate([shift_first[3:], shift_first[:3]])
+
+
 @lru_cache(maxsize=16)
 def _model(flange_offset_m: float) -> tuple[Any, int]:
     """Pinocchio turns about z first, so a joint's placement is what follows the joint before it."""

@@ -169,6 +169,11 @@ class Intrinsics:
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
+    @property
+    def vector(self) -> Float64:
+        """(9,) fx, fy, cx, cy, then the distortion."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
