@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from surfclass.types import Float64
 
 
@@ -36,6 +38,12 @@ class Disc:
     saturated: float
     ring_only: bool
     outline: Float64
+
+    @property
+    def depth_sd_m(self) -> float:
+        """Standard deviation of the centre along the line of sight."""
+        ray = self.camera_m / np.linalg.norm(self.camera_m)
+        return float(np.sqrt(ray @ self.camera_covariance @ ray))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
