@@ -9,7 +9,7 @@ import numpy as np
 
 from surfclass.errors import InputError
 from surfclass.frames import Capture
-from surfclass.rig import DepthRig
+from surfclass.rig import Arm, DepthRig
 from surfclass.types import Float64, Transform, freeze
 
 # Standard D-H rows of the VM-6083 (Table 6.1): alpha, a, d, theta at zero. The last d is the flange offset.
@@ -51,6 +51,21 @@ def forward_kinematics(q: Float64, flange_offset_m: float = 0.084) -> Transform:
     data = model.createData()  # per call: a Data is written to, and callers may be threads
     pinocchio.framesForwardKinematics(model, data, angles)
     return Transform("base", "flange", data.oMf[flange].homogeneous)
+
+
+def flange_pose(q: Float64, arm: Arm) -> Transform:
+    """Returns the flange's pose in the base of one arm from its joints' read-out `q` (6,), rad.
+
+    Raises:
+        InputError: As `forward_kinematics`.
+    """
+    return forward_kinematics(corrected(q, arm), arm.flange_offset_m)
+
+
+def corrected(q: Float64, arm: Arm) -> Float64:
+    """Returns the joint angles (6,), rad, that a read-out stands for."""
+    angles: Float64 = np.asarray(q, np.float64) + np.array(arm.joint_offsets_rad)
+    return angles
 
 
 def flange_jacobian(q: Float64, flange_offset_m: float = 0.084) -> Float64:
@@ -124,7 +139,7 @@ def depth_pose(capture: Capture, rig: DepthRig) -> Transform:
         return recorded
     if recorded is not None and rig.transforms.flange_T_depth is None:
         return recorded
-    computed = forward_kinematics(joints.q, rig.arm.flange_offset_m) @ rig.flange_T_depth
+    computed = flange_pose(joints.q, rig.arm) @ rig.flange_T_depth
     if recorded is None:
         return computed
     distance, angle = pose_difference(recorded, computed)
@@ -132,6 +147,6 @@ def depth_pose(capture: Capture, rig: DepthRig) -> Transform:
         raise InputError(
             f"capture {capture.name}: base_T_depth and the joint angles differ by {distance * 1e3:.2f} mm "
             f"and {np.degrees(angle):.3f}°, allowed are 1 mm and 0.1°; the hand-eye transform, "
-            "arm.flange_offset_m, the angles or the pose are wrong"
+            "the arm's table, the angles or the pose are wrong"
         )
     return recorded

@@ -152,9 +152,15 @@ class Lens(Table):
 
 
 class Arm(Table):
-    """What differs between mounted VM-6083 arms: the last D-H length (public tables disagree)."""
+    """What differs between mounted VM-6083 arms.
+
+    Attributes:
+        flange_offset_m: The last D-H length (public tables disagree).
+        joint_offsets_rad: What to add to each joint's read-out.
+    """
 
     flange_offset_m: Positive = 0.084
+    joint_offsets_rad: tuple[Number, Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class DepthRig(Table):
