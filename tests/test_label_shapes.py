@@ -62,9 +62,15 @@ def test_small_regions_and_small_holes_are_left_out():
     label[10:40, 10:40] = 1
     label[20:22, 20:22] = 0
     label[2:4, 2:4] = 2
-    painted = rasterise(outlines(label, least_px=5), empty(50, 50))
+    painted = rasterise(outlines(label, least_px=5, least_hole_px=5), empty(50, 50))
     assert set(np.unique(painted)) == {0, 1}
     assert (painted == 1).sum() == 900
+
+
+def test_what_is_unlabelled_outside_of_everything_needs_no_shape():
+    label = empty(50, 50)
+    label[10:40, 20:25] = label[10:15, 20:45] = 1
+    assert [shape.label for shape in outlines(label)] == [1]
 
 
 def test_the_last_shape_is_on_top_and_zero_erases_what_lies_below():

@@ -23,6 +23,7 @@ from surfclass.rig import DepthRig, Rig, SurfaceClasses, parse_classes
 
 _SMOOTH_PX = 1.0  # how far a suggestion's outline may be from its pixels
 _LEAST_SHARE = 1e-4  # of the image: regions of a suggestion below it are noise
+_LEAST_HOLE = 5e-4  # of the image: holes below it are where depth was not seen
 
 
 class StaleViewError(InputError):
@@ -136,7 +137,8 @@ class LabelSession:
             return ()
         if self.state_of(index).below:  # what was recorded stays: a suggestion is put on top of it
             label = np.where(view.below > 0, view.below, label)
-        return outlines(label, _SMOOTH_PX, round(_LEAST_SHARE * label.size))
+        least = (round(share * label.size) for share in (_LEAST_SHARE, _LEAST_HOLE))
+        return outlines(label, _SMOOTH_PX, *least)
 
     def finish(self) -> int:
         """Writes the labelled recording, whole or not at all, and returns how many captures have labels.

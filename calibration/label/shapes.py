@@ -41,7 +41,9 @@ def rasterise(shapes: Sequence[Shape], below: NDArray[np.uint8]) -> NDArray[np.u
     return label
 
 
-def outlines(label: NDArray[np.uint8], tolerance_px: float = 0.0, least_px: int = 1) -> tuple[Shape, ...]:
+def outlines(
+    label: NDArray[np.uint8], tolerance_px: float = 0.0, least_px: int = 1, least_hole_px: int = 1
+) -> tuple[Shape, ...]:
     """Returns polygons that `rasterise` turns into this label image again.
 
     Every region of one label is its filled outline; regions inside it, holes too, are smaller and painted
@@ -50,44 +52,39 @@ def outlines(label: NDArray[np.uint8], tolerance_px: float = 0.0, least_px: int 
     Args:
         label: (h, w).
         tolerance_px: How far an outline may be from the region's, to have fewer corners; 0 is exact.
-        least_px: Regions of fewer pixels, and holes, are left out.
+        least_px: Regions of fewer pixels are left out.
+        least_hole_px: Holes of fewer pixels are filled.
     """
     found: list[Shape] = []
-    covered = np.zeros(label.shape, bool)  # by an outline: what is unlabelled elsewhere needs none
-    regions = [one for value in np.unique(label) for one in _regions(label == value, int(value), least_px)]
-    for _, value, offset, contour in sorted(regions, key=lambda region: -region[0]):
-        box = _box(offset, contour)
-        if value == 0 and not covered[box].any():
+    covered = np.zeros_like(label)  # by an outline: what is unlabelled elsewhere needs none
+    least = {int(value): least_px if value else least_hole_px for value in np.unique(label)}
+    regions = [one for value, size in least.items() for one in _regions(label == value, value, size)]
+    for _, value, contour in sorted(regions, key=lambda region: -region[0]):
+        column, row = contour[0, 0]
+        if value == 0 and not covered[row, column]:
             continue
-        covered[box] = True
+        cv2.fillPoly(covered, [contour], 1)
         smooth = cv2.approxPolyDP(contour, tolerance_px, closed=True) if tolerance_px else contour
-        corners = (smooth[:, 0] + offset).tolist()
+        corners = smooth[:, 0].tolist()
         while len(corners) < 3:  # a region one pixel wide is a line or a point
             corners.append(corners[-1])
         found.append(Shape(label=value, points=tuple((float(x), float(y)) for x, y in corners)))
     return tuple(found)
 
 
-_Region = tuple[int, int, NDArray[np.int32], NDArray[np.int32]]
+_Region = tuple[int, int, NDArray[np.int32]]
 
 
 def _regions(mask: NDArray[np.bool_], value: int, least_px: int) -> list[_Region]:
-    """The 4-connected regions of a mask: filled area, value, offset (2,) and outline (n, 1, 2)."""
+    """The 4-connected regions of a mask: filled area, value and outline (n, 1, 2)."""
     count, number, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     regions: list[_Region] = []
     for index in range(1, count):
         x, y, w, h, count_px = statistics[index]
         if count_px < least_px:
             continue
-        own = np.pad((number[y : y + h, x : x + w] == index).astype(np.uint8), 1)
+        own = (number[y : y + h, x : x + w] == index).astype(np.uint8)
         contours, _ = cv2.findContours(own, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        filled = cv2.fillPoly(np.zeros_like(own), contours, 1)
-        regions.append(
-            (int(filled.sum()), value, np.array([x - 1, y - 1], np.int32), np.asarray(contours[0], np.int32))
-        )
+        filled_px = int(cv2.fillPoly(np.zeros_like(own), contours, 1).sum())
+        regions.append((filled_px, value, np.asarray(contours[0], np.int32) + np.array([x, y], np.int32)))
     return regions
-
-
-def _box(offset: NDArray[np.int32], contour: NDArray[np.int32]) -> tuple[slice, slice]:
-    (left, top), (right, bottom) = contour.min(axis=(0, 1)) + offset, contour.max(axis=(0, 1)) + offset
-    return slice(top, bottom + 1), slice(left, right + 1)
