@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from types import TracebackType
 from typing import Self
@@ -15,7 +16,16 @@ from drivers.errors import (
     DriverError,
     DriverUnavailableError,
 )
-from drivers.interfaces import Arm, Clock, ColourCamera, DepthCamera, Device, Light
+from drivers.interfaces import (
+    Arm,
+    Clock,
+    ColourCamera,
+    DepthCamera,
+    Device,
+    ExposureControl,
+    Light,
+    exposure_control,
+)
 from surfclass.errors import ConfigurationError
 from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
 
@@ -141,6 +151,29 @@ class SensorPackage:
         self._must_be_open()
         for device in self._devices:
             device.check()
+
+    def about(self) -> dict[str, Mapping[str, str]]:
+        """Returns by name what each open device tells about itself.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the first that fails.
+        """
+        self._must_be_open()
+        return {device.name: device.about() for device in self._devices}
+
+    def exposure_control(self) -> ExposureControl | None:
+        """Returns the colour camera as one whose exposure can be changed, or None where it cannot.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError, DeviceFaultError: As the class says.
+        """
+        self._must_be_open()
+        return exposure_control(self._colour)
+
+    @property
+    def has_arm(self) -> bool:
+        """Whether captures get joint angles."""
+        return self._arm is not None
 
     def read_joints(self) -> JointState | None:
         """Returns the joint angles as of now, or None without an arm.

@@ -17,6 +17,7 @@ from drivers.sim.world import SimWorld
 from surfclass.errors import InputError
 
 CELL_VIEWS = ("front_065", "left_065", "upper_075", "plate_070", "corner_090", "steep_105", "whole_130")
+_SHOWN_ALREADY = ("limits:", "exposure_card")  # boards and a card as in other scenes, from elsewhere
 _TILE = (240, 180)
 _CAPTION_PX = 18
 _NEAR_MM, _FAR_MM = 500, 1700
@@ -32,7 +33,7 @@ def contact_sheet(seed: int = 0, scale: float = 1.0) -> Image:
         scale: Of the rendered images; the tiles have one size in any case.
     """
     strips = []
-    for scene in SCENES:
+    for scene in (one for one in SCENES if not one.startswith(_SHOWN_ALREADY)):
         world = SimWorld(scene, seed, scale=scale)
         names = CELL_VIEWS if scene == "cell" else (world.viewpoints[0].name,)
         strips += [_strip(world, one) for one in world.viewpoints if one.name in names]

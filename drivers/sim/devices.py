@@ -67,7 +67,12 @@ class SimDevice:
 
     def about(self) -> Mapping[str, str]:
         """Says that it is simulated."""
-        return {"library": "drivers.sim", "model": f"simulated {self.kind}", "clock": "the world's"}
+        return {
+            "library": "drivers.sim",
+            "model": f"simulated {self.kind}",
+            "serial": f"SIM-{self.kind.upper()}",
+            "clock": "the world's",
+        }
 
     def __enter__(self) -> Self:
         self.open()

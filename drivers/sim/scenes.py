@@ -92,6 +92,16 @@ def _board(material: str) -> Scene:
     return Scene(f"board:{material}", (*box(board, 0.010), wall()), tuple(looks))
 
 
+def _limits(material: str) -> Scene:
+    centre, yaw = (1.46, 0.0, 0.76), 25.0  # the arm reaches 45° to either side
+    board = upright(f"limits.{material}", centre, (0.80, 0.62), (material,), yaw=-yaw)
+    distances = (0.52, 0.57, 0.62, 0.68, 0.74, 0.80, 0.88, 0.96, 1.05, 1.20)
+    looks = [Look(f"at_{round(1000 * distance):04d}", centre, distance, yaw) for distance in distances]
+    angles = (10, 20, 28, 36, 44, 52, 60)
+    looks += [Look(f"oblique_{angle:02d}", centre, 0.70, yaw - angle) for angle in angles]
+    return Scene(f"limits:{material}", (*box(board, 0.010), wall()), tuple(looks))
+
+
 def _checkerboard() -> Scene:
     x, z = 1.46, 0.65
     centre, aim = (x, 0.0, z), (x, 0.0, z + 0.04)  # the depth camera, whose IR sees it too, looks lower
@@ -130,13 +140,19 @@ def _reflector_discs() -> Scene:
         ("plate", "reflector"),
         discs(DISC_PLACES_M, DISC_RADIUS_M),
     )
+    # Chosen for what they tell of the hand-eye: directions and rolls that differ much, all discs in sight.
     tilts = (
-        (0, 0, 0), (22, 0, 15), (-22, 0, -15), (0, 22, 0), (0, -20, 10), (18, 16, -10), (-18, 16, 20),
-        (18, -16, 0), (-18, -14, -20), (30, 5, 8), (-30, 5, -8), (8, 16, 12), (0, 0, 30), (12, -8, -25),
+        (38, -15, 45, 0.90), (30, -15, -90, 0.80), (-38, -15, -60, 0.80), (-30, 5, 90, 0.80),
+        (38, -5, 90, 0.80), (-30, -25, 60, 0.80), (-20, 25, -90, 1.00), (0, 25, 20, 1.00),
+        (30, -25, -60, 0.90), (-38, -5, 20, 1.00), (30, 15, 60, 1.00), (-38, 5, -45, 1.00),
+        (-10, 25, -45, 0.90),
     )  # fmt: skip
-    looks = tuple(
-        Look(f"tilt_{index:02d}", aim, 0.85 + 0.03 * (index % 7), turn, rise, roll)
-        for index, (turn, rise, roll) in enumerate(tilts)
+    looks = (
+        Look("tilt_00", aim, 0.85),
+        *(
+            Look(f"tilt_{index:02d}", centre, distance, turn, rise, roll, "depth")
+            for index, (turn, rise, roll, distance) in enumerate(tilts, start=1)
+        ),
     )
     return Scene("reflector_discs", (*box(plate, 0.006, ("plate",)), wall()), looks)
 
@@ -154,6 +170,11 @@ def _grey_card() -> Scene:
     return Scene("grey_card", (*box(card, 0.004), wall()), looks + tilted)
 
 
+def _exposure_card() -> Scene:
+    card = _grey_card()
+    return Scene("exposure_card", card.surfaces, (Look("at_0800", (BOARD_X_M, 0.0, BOARD_Z_M), 0.80),))
+
+
 def _highlight_board() -> Scene:
     board = upright("board", (BOARD_X_M, 0.0, BOARD_Z_M), (0.90, 0.70), ("semi-gloss",))
     centre = (BOARD_X_M, 0.0, BOARD_Z_M)
@@ -163,6 +184,10 @@ def _highlight_board() -> Scene:
         Look("risen_080", centre, 0.80, turn=-8, rise=8),
         Look("facing_090", centre, 0.90, turn=-4, rise=-5),
         Look("facing_110", centre, 1.10, turn=3),
+        Look("turned_060", centre, 0.60, turn=-14, rise=-2),
+        Look("risen_075", centre, 0.75, turn=5, rise=11),
+        Look("sunk_095", centre, 0.95, turn=-11, rise=-7),
+        Look("turned_098", centre, 0.98, turn=12, rise=5),
     )
     return Scene("highlight_board", (*box(board, 0.004), wall()), looks)
 
@@ -170,9 +195,11 @@ def _highlight_board() -> Scene:
 _BUILDERS: dict[str, Callable[[], Scene]] = {
     "cell": _cell,
     **{f"board:{name}": partial(_board, name) for name in CLASS_NAMES},
+    **{f"limits:{name}": partial(_limits, name) for name in CLASS_NAMES},
     "checkerboard": _checkerboard,
     "reflector_discs": _reflector_discs,
     "grey_card": _grey_card,
+    "exposure_card": _exposure_card,
     "highlight_board": _highlight_board,
 }
 SCENES = tuple(_BUILDERS)

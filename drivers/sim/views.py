@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import radians
+from typing import Literal
 
 import numpy as np
 
@@ -41,7 +42,8 @@ class Look:
     """A wanted view of `target`.
 
     `turn` is in degrees around the vertical (positive: from the left), `rise` from above, `roll`
-    about the line of sight.
+    about the line of sight. `camera`, "rgb" or "depth", is the one that has the target in its middle
+    and at that distance.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Look:
     turn: float = 0.0
     rise: float = 0.0
     roll: float = 0.0
+    camera: Literal["rgb", "depth"] = "rgb"
 
 
 def reach(looks: Sequence[Look], surfaces: Sequence[Surface]) -> tuple[Viewpoint, ...]:
@@ -63,6 +66,8 @@ def reach(looks: Sequence[Look], surfaces: Sequence[Surface]) -> tuple[Viewpoint
     found = []
     for look in looks:
         base_T_rgb = _camera_pose(look)
+        if look.camera == "depth":
+            base_T_rgb = base_T_rgb @ package.rgb_T_depth.inverse
         near = joints_of(base_T_rgb @ package.flange_T_rgb.inverse, near, package.flange_offset_m)
         middle = cast(faces_from(surfaces, base_T_rgb.inverse), np.zeros((2, 1, 1), np.float32))
         normal = middle.faces[int(middle.face[0, 0])].normal
@@ -83,4 +88,4 @@ def _camera_pose(look: Look) -> Transform:
     matrix = np.eye(4)
     matrix[:3, :3] = np.column_stack([x, np.cross(forward, x), forward])
     matrix[:3, 3] = np.array(look.target) + look.distance_m * to_camera
-    return Transform("base", "rgb", matrix)
+    return Transform("base", look.camera, matrix)
