@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surfclass.classifiers.reliability import calibration_error
 from surfclass.errors import InputError
 from surfclass.frames import Capture
 from surfclass.kinematics import depth_pose
 from surfclass.pipeline import Pipeline
 from surfclass.pooling import Pool, fuse, is_known
 from surfclass.rig import ColourFeature, Rig
-from surfclass.types import Bool, Float32, Float64, Int32, Observation
+from surfclass.types import Bool, Float32, Int32, Observation
 from surfclass.viewing import view_surface
 from surfclass.voxel_index import Keys, pack, unpack, voxel_of
 from surfclass.voxel_map import MapLayers
 
 SCHEMA = 1
-CALIBRATION_BINS = 15
 ROUTES: dict[str, ColourFeature | None] = {
     "rgb": "RGB",
     "ab": "a*b*",
@@ -38,7 +38,7 @@ class Score:
     Attributes:
         overall: Share of all n samples whose most probable class is the true one.
         balanced: Mean over the classes present of the share that is right.
-        ece: Expected calibration error of the classified samples, in CALIBRATION_BINS equal bins.
+        ece: Expected calibration error of the classified samples, as `reliability.calibration_error` has it.
         nll: Mean of -log of the true class's probability over the classified samples, nats.
         rejected: Share of samples without a distribution; they count as wrong above.
         voxels: Number of samples.
@@ -107,18 +107,6 @@ def accuracy(
         return np.nan, np.nan, confusion
     right = np.diag(confusion)
     return float(right.sum() / total.sum()), float((right[present] / total[present]).mean()), confusion
-
-
-def calibration_error(confidence: Float64, right: Bool) -> float:
-    """Returns the expected calibration error: the mean gap between confidence and accuracy.
-
-    The gap is taken in CALIBRATION_BINS equal bins of confidence and weighted by their share.
-    """
-    if not len(confidence):
-        return np.nan
-    bins = np.minimum((confidence * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
-    gap = np.bincount(bins, confidence - right, CALIBRATION_BINS)
-    return float(np.abs(gap).sum() / len(confidence))
 
 
 class Benchmark:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -15,11 +16,11 @@ from surfclass.classifiers.naive_bayes import NaiveBayes
 from surfclass.classifiers.svm import Svm
 from surfclass.classifiers.table import PosteriorTable
 from surfclass.errors import ConfigurationError, InputError
-from surfclass.rig import ColourFeature, Response, Rig, SurfaceClasses
+from surfclass.rig import ColourFeature, Rig, SurfaceClasses
 from surfclass.routes import Classifier, ColourRoute, TextureRoute
-from surfclass.types import Float64
 
-SCHEMA = 1
+SCHEMA = 2
+_FITTED_TOGETHER = ("light",)
 _KINDS: dict[str, type[Svm] | type[NaiveBayes]] = {"svm": Svm, "naive_bayes": NaiveBayes}
 
 
@@ -31,21 +32,20 @@ class Model:
         classes: The surface types, in the order of every distribution.
         colour: One route for each colour feature that could be trained.
         texture: The texture route.
-        a2_a1_a0: (3, 3) the polynomial of Eq. 4.4 that training fitted, where the rig had none.
+        rig_values: What training found of the rig where the rig said nothing, nested as in `rig.toml`:
+            response, vignetting and the light's fall-off, or the polynomial of Eq. 4.4.
         card: Provenance and figures, JSON.
     """
 
     classes: SurfaceClasses
     colour: dict[ColourFeature, ColourRoute]
     texture: TextureRoute
-    a2_a1_a0: Float64 | None = None
+    rig_values: Mapping[str, Any] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
     def complete(self, rig: Rig) -> Rig:
-        """Returns the rig with the polynomial that training fitted, where the rig has none."""
-        if self.a2_a1_a0 is None or (rig.response is not None and rig.response.a2_a1_a0 is not None):
-            return rig
-        return with_polynomial(rig, self.a2_a1_a0)
+        """Returns the rig with what training found, where the rig says nothing (`completed`)."""
+        return completed(rig, self.rig_values)
 
     def colour_route(self, feature: ColourFeature) -> ColourRoute:
         """Returns the route of one colour feature.
@@ -95,12 +95,11 @@ class Model:
             "classifier": _kind(self.texture.classifier),
         }
         arrays |= _prefixed("texture.classifier.", self.texture.classifier.to_arrays())
-        if self.a2_a1_a0 is not None:
-            arrays["a2_a1_a0"] = self.a2_a1_a0
         head = {
             "schema": SCHEMA,
             "classes": self.classes.model_dump(mode="json"),
             "routes": routes,
+            "rig_values": self.rig_values,
             "card": self.card,
         }
         arrays["head"] = np.frombuffer(json.dumps(head, sort_keys=True).encode(), np.uint8)
@@ -152,14 +151,41 @@ class Model:
             classifier=_KINDS[told["classifier"]].from_arrays(_below("texture.classifier.", arrays)),
         )
         classes = SurfaceClasses.model_validate(head["classes"])
-        return cls(classes, colour, texture, arrays.get("a2_a1_a0"), head["card"])
+        told = head["rig_values"]
+        if not isinstance(told, dict) or set(told) - set(Rig.model_fields):
+            raise InputError(f"rig values {told!r:.80}, allowed are tables of rig.toml")
+        return cls(classes, colour, texture, told, head["card"])
 
 
-def with_polynomial(rig: Rig, rows: Float64) -> Rig:
-    """Returns the rig with the polynomial of Eq. 4.4 set to `rows` (3, 3)."""
-    inverse = None if rig.response is None else rig.response.inverse
-    response = Response.model_validate({"a2_a1_a0": rows.tolist(), "inverse": inverse})
-    return rig.model_copy(update={"response": response})
+def completed(rig: Rig, values: Mapping[str, Any]) -> Rig:
+    """Returns the rig with those of `values` that it does not have itself.
+
+    A light is one thing: where its direction or its fall-off is filled in, so is the position that they
+    were fitted with.
+
+    Args:
+        rig: What it says stays.
+        values: Nested as in `rig.toml`.
+
+    Raises:
+        ConfigurationError: If a value is not what `rig.toml` allows.
+    """
+    lacking = _lacking(rig.model_dump(by_alias=True, exclude_unset=True), values)
+    return rig.with_values(lacking).whole() if lacking else rig
+
+
+def _lacking(told: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """What of `values` is not in `told`, table by table."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        have = told.get(key)
+        if have is None:
+            found[key] = value
+        elif isinstance(have, Mapping) and isinstance(value, Mapping):
+            below = _lacking(have, value)
+            if below:
+                found[key] = value if key in _FITTED_TOGETHER else below
+    return found
 
 
 def _kind(classifier: Classifier) -> str:

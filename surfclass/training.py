@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from surfclass import reflectance
 from surfclass.classifiers import naive_bayes, svm
+from surfclass.classifiers.folds import deal_folds
+from surfclass.classifiers.search import Trial, search
+from surfclass.classifiers.selection import Selection
 from surfclass.classifiers.table import PosteriorTable
 from surfclass.colour import as_fraction
 from surfclass.errors import InputError, MissingCalibrationError
 from surfclass.frames import Capture
-from surfclass.model import Model, with_polynomial
-from surfclass.pipeline import lit_image, naming
+from surfclass.model import Model, completed
+from surfclass.pipeline import lit_image
 from surfclass.rig import ColourFeature, Rig, SurfaceClasses
-from surfclass.routes import (
-    Classifier,
-    ColourRoute,
-    Image,
-    ReflectanceMode,
-    TextureRoute,
-    colour_features,
-    exposure_ratio,
-    texture_features,
-)
+from surfclass.routes import Classifier, ColourRoute, ReflectanceMode, TextureRoute
+from surfclass.sampling import Note, Samples, Sampling
 from surfclass.types import Float64
 from surfclass.viewing import view_surface
 
-Note = Callable[[str], None]
+_POOL = 4  # samples of a class and capture among which the drawing can choose, over those it takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +36,19 @@ class TrainingSettings:
         classifier: "svm" (RBF for colour, linear for texture), or "naive_bayes".
         reflectance: How K_d is computed; None takes the full model where the rig has what it
             needs, else the printed polynomial.
-        pixels_per_class: Colour samples of each class, drawn evenly from its captures.
+        pixels_per_class: Colour samples of each class.
         windows_per_class: Texture samples of each class.
         window_px: Side of a texture window.
         place_px: Side of the square of pixels that is one place for hold-out.
-        C: SVM's penalty.
-        gamma: RBF's width, for standardised features.
+        selection: How samples are drawn: "even" over places and intensities, or "random".
+        C: SVM's penalty; None: by cross-validation out of `search_C` or `search_texture_C`.
+        gamma: RBF's width, for standardised features; None: by cross-validation out of `search_gamma`.
+        search_C: What is tried for colour.
+        search_gamma: Likewise.
+        search_texture_C: What is tried for texture: its many features overlap less, and large penalties
+            take the linear machine minutes without being better.
+        search_per_class: Samples of each class that are tried with.
+        search_folds: Of the hold-out by which the two are chosen.
         folds: Of the hold-out that the posteriors are fitted on.
         seed: Of the drawing and the folds.
     """
@@ -58,37 +59,52 @@ class TrainingSettings:
     windows_per_class: int = 1000
     window_px: int = 20
     place_px: int = 80
-    C: float = 10.0
-    gamma: float = 1.0
+    selection: Selection = "even"
+    C: float | None = None
+    gamma: float | None = None
+    search_C: tuple[float, ...] = (1.0, 10.0, 100.0)
+    search_texture_C: tuple[float, ...] = (0.01, 0.1, 1.0)
+    search_gamma: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
+    search_per_class: int = 400
+    search_folds: int = 3
     folds: int = 5
     seed: int = 0
 
 
-@dataclass(slots=True)
-class _Samples:
-    """Samples of one route as they are gathered, capture by capture."""
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """What a route said of its training samples without having seen the places that they are from.
 
-    values: list[Float64] = field(default_factory=list)
-    labels: list[NDArray[np.intp]] = field(default_factory=list)
-    places: list[NDArray[np.intp]] = field(default_factory=list)
+    Attributes:
+        samples: Labels, places, captures, distances and angles.
+        posterior: (n, k) class distributions.
+        by: "groups" where no sample's place was trained on; "samples" where a class had one place only.
+        C: SVM's penalty; None for another classifier.
+        gamma: RBF's width, likewise.
+        trials: What was tried to choose them.
+    """
 
-    def add(self, values: NDArray[Any], label: int, places: NDArray[Any]) -> None:
-        self.values.append(values.astype(np.float64))
-        self.labels.append(np.full(len(values), label, np.intp))
-        self.places.append(places.astype(np.intp))
+    samples: Samples
+    posterior: Float64
+    by: Literal["groups", "samples"]
+    C: float | None
+    gamma: float | None
+    trials: tuple[Trial, ...]
 
-    def drawn(
-        self, per_class: int, rng: np.random.Generator
-    ) -> tuple[Float64, NDArray[np.intp], NDArray[np.intp]]:
-        """At most `per_class` samples of each class, drawn without replacement."""
-        values, labels = np.concatenate(self.values), np.concatenate(self.labels)
-        places = np.concatenate(self.places)
-        chosen = []
-        for label in np.unique(labels):
-            rows = np.flatnonzero(labels == label)
-            chosen.append(rows if len(rows) <= per_class else rng.choice(rows, per_class, replace=False))
-        rows = np.sort(np.concatenate(chosen))
-        return values[rows], labels[rows], places[rows]
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trained:
+    """A model and what is known of it.
+
+    Attributes:
+        model: The model.
+        held_out: By route: "RGB", "a*b*", "K_d" and the texture feature.
+        captures: Names of the captures that it was trained on, by their number in `held_out`.
+    """
+
+    model: Model
+    held_out: dict[str, HeldOut]
+    captures: list[str]
 
 
 def train(
@@ -99,6 +115,23 @@ def train(
     settings: TrainingSettings | None = None,
     note: Note = lambda _: None,
 ) -> Model:
+    """Returns the model of `train_checked`, whose arguments these are.
+
+    Raises:
+        InputError, MissingCalibrationError: As `train_checked`.
+    """
+    return train_checked(captures, response_captures, rig, classes, settings, note).model
+
+
+def train_checked(
+    captures: Iterable[Capture],
+    response_captures: Iterable[Capture],
+    rig: Rig,
+    classes: SurfaceClasses,
+    settings: TrainingSettings | None = None,
+    note: Note = lambda _: None,
+    rig_values: Mapping[str, Any] | None = None,
+) -> Trained:
     """Returns a model with a colour route for every feature that the rig allows, and a texture route.
 
     Args:
@@ -109,17 +142,19 @@ def train(
         classes: What the labels mean.
         settings: See TrainingSettings.
         note: Called with a sentence at each step.
+        rig_values: What else is known of the rig; it completes the rig, and the model keeps it.
 
     Raises:
         InputError: If there is no labelled capture, or a class has no sample.
         MissingCalibrationError: If K_d is the rig's colour feature and cannot be computed.
     """
     settings = settings or TrainingSettings()
+    values = dict(rig_values or {})
+    rig = completed(rig, values)
     mode = _reflectance_mode(rig, settings, note)
-    fitted = None
     if mode == "thesis" and (rig.response is None or rig.response.a2_a1_a0 is None):
         try:
-            fitted = fit_response(response_captures, rig)
+            polynomial = fit_response(response_captures, rig)
         except MissingCalibrationError as error:
             if rig.features.colour == "K_d":
                 raise
@@ -127,26 +162,30 @@ def train(
             mode = None
         else:
             note("fitted the polynomial of Eq. 4.4 to the response captures")
-            rig = with_polynomial(rig, fitted)
+            values["response"] = {**values.get("response", {}), "a2_a1_a0": polynomial.tolist()}
+            rig = completed(rig, values)
     features: list[ColourFeature] = ["RGB", "a*b*"] if mode is None else ["RGB", "a*b*", "K_d"]
 
-    gathered = _gather(captures, features, rig, len(classes.names), mode or "thesis", settings, note)
-    rng = np.random.default_rng(settings.seed)
+    sampling = Sampling(
+        features, mode or "thesis", len(classes.names), _POOL * settings.pixels_per_class,
+        settings.window_px, settings.place_px, settings.seed,
+    )  # fmt: skip
+    gathered = sampling.gather(captures, rig, note)
     colour: dict[ColourFeature, ColourRoute] = {}
+    held_out: dict[str, HeldOut] = {}
     for feature in features:
         note(f"training the {feature} route")
-        drawn = gathered.colour[feature].drawn(settings.pixels_per_class, rng)
-        _every_class_has_samples(
-            drawn[1], classes, f"{feature} pixel (K_d needs a normal and a good exposure)"
-        )
-        classifier = _fit(*drawn, "rbf", settings)
-        table = _tabulate(classifier, drawn[0]) if isinstance(classifier, svm.Svm) else None
+        drawn = gathered.colour[feature].drawn(settings.pixels_per_class, settings.selection, settings.seed)
+        _every_class_has_samples(drawn, classes, f"{feature} pixel (K_d needs a normal and a good exposure)")
+        classifier, held_out[feature] = _fit(drawn, "rbf", settings)
+        table = _tabulate(classifier, drawn.values) if isinstance(classifier, svm.Svm) else None
         colour[feature] = ColourRoute(feature, mode or "thesis", gathered.exposure_s, classifier, table)
     note(f"training the {rig.features.texture} route")
-    drawn = gathered.texture.drawn(settings.windows_per_class, rng)
+    drawn = gathered.texture.drawn(settings.windows_per_class, settings.selection, settings.seed)
     side = settings.window_px
-    _every_class_has_samples(drawn[1], classes, f"window of {side} × {side} px that is all of one label")
-    texture = TextureRoute(rig.features.texture, settings.window_px, _fit(*drawn, "linear", settings))
+    _every_class_has_samples(drawn, classes, f"window of {side} × {side} px that is all of one label")
+    classifier, held_out[rig.features.texture] = _fit(drawn, "linear", settings)
+    texture = TextureRoute(rig.features.texture, settings.window_px, classifier)
     card = {
         "settings": asdict(settings),
         "rig": rig.name,
@@ -154,75 +193,7 @@ def train(
         "reflectance": mode,
         "exposure_s": gathered.exposure_s,
     }
-    return Model(classes, colour, texture, fitted, card)
-
-
-@dataclass(slots=True)
-class _Gathered:
-    """What one pass over the training captures leaves."""
-
-    colour: dict[ColourFeature, _Samples]
-    texture: _Samples = field(default_factory=_Samples)
-    names: list[str] = field(default_factory=list)
-    exposure_s: float | None = None
-
-
-def _gather(
-    captures: Iterable[Capture],
-    features: list[ColourFeature],
-    rig: Rig,
-    class_count: int,
-    mode: ReflectanceMode,
-    settings: TrainingSettings,
-    note: Note,
-) -> _Gathered:
-    rng = np.random.default_rng(settings.seed)
-    gathered = _Gathered({feature: _Samples() for feature in features})
-    for number, capture in enumerate(captures):
-        rig.check(capture)
-        if capture.label is None or capture.colour is None:
-            raise InputError(f"capture {capture.name}: role 'train', but it has no labelled colour image")
-        if not capture.label.any():
-            note(f"capture {capture.name}: nothing in it is labelled, so nothing is learnt from it")
-            continue
-        if not gathered.names:
-            gathered.exposure_s = capture.colour.exposure_s
-        gathered.names.append(capture.name)
-        with naming(capture):
-            view, image = view_surface(capture.depth.depth_mm, rig), lit_image(capture, rig)
-        ratio = exposure_ratio(gathered.exposure_s, capture.colour.exposure_s)
-        for feature, samples in gathered.colour.items():
-            with naming(capture):
-                values, valid = colour_features(feature, image, view, rig, mode, ratio)
-            for label in range(class_count):
-                pixels = np.argwhere(valid & (capture.label == label + 1))
-                if len(pixels) > settings.pixels_per_class:
-                    pixels = pixels[rng.choice(len(pixels), settings.pixels_per_class, replace=False)]
-                row, col = pixels.T
-                samples.add(values[:, row, col].T, label, _place(row, col, number, settings.place_px))
-        _gather_windows(gathered.texture, image, capture.label, number, rig, class_count, settings)
-    if not gathered.names:
-        raise InputError("there is no capture of role 'train' with a label to train from")
-    return gathered
-
-
-def _gather_windows(
-    samples: _Samples,
-    image: Image,
-    label: NDArray[np.uint8],
-    number: int,
-    rig: Rig,
-    class_count: int,
-    settings: TrainingSettings,
-) -> None:
-    side, stride = settings.window_px, settings.window_px // 2
-    features = texture_features(rig.features.texture, image, side, stride)
-    grid = np.indices(features.shape[:2]) * stride + side // 2
-    pure = _pure_windows(label, side, stride)
-    for k in range(class_count):
-        chosen = pure == k + 1
-        row, col = grid[:, chosen]
-        samples.add(features[chosen], k, _place(row, col, number, settings.place_px))
+    return Trained(Model(classes, colour, texture, values, card), held_out, gathered.names)
 
 
 def _tabulate(classifier: svm.Svm, values: Float64) -> PosteriorTable:
@@ -295,42 +266,51 @@ def response_samples(captures: Iterable[Capture], rig: Rig) -> tuple[Float64, Fl
     return np.array(distance, np.float64), np.array(intensity, np.float64)
 
 
-def _pure_windows(label: NDArray[np.uint8], side: int, stride: int) -> NDArray[np.uint8]:
-    """The label of every window that has but one, 0 for the others."""
-    windows = np.lib.stride_tricks.sliding_window_view(label, (side, side))[::stride, ::stride]
-    low, high = windows.min(axis=(2, 3)), windows.max(axis=(2, 3))
-    pure: NDArray[np.uint8] = np.where(low == high, low, np.uint8(0))
-    return pure
-
-
-def _fit(
-    values: Float64,
-    labels: NDArray[np.intp],
-    places: NDArray[np.intp],
-    kernel: Literal["rbf", "linear"],
-    settings: TrainingSettings,
-) -> Classifier:
+def _fit(drawn: Samples, kernel: svm.Kernel, settings: TrainingSettings) -> tuple[Classifier, HeldOut]:
+    """Fits the classifier, and says what it makes of each sample without having seen its place."""
     if settings.classifier == "naive_bayes":
-        return naive_bayes.train(values, labels)
-    return svm.train(
-        values,
-        labels,
-        places,
+        return _fit_naive_bayes(drawn, settings)
+    C, gamma, trials = settings.C, settings.gamma, tuple[Trial, ...]()
+    if C is None or gamma is None:
+        few = drawn.drawn(settings.search_per_class, settings.selection, settings.seed)
+        chosen, tried = search(
+            few.values,
+            few.label,
+            few.place,
+            kernel,
+            (settings.search_C if kernel == "rbf" else settings.search_texture_C) if C is None else (C,),
+            settings.search_gamma if gamma is None else (gamma,),
+            settings.search_folds,
+            settings.seed,
+        )
+        C, gamma, trials = chosen.C, chosen.gamma, tuple(tried)
+    found = svm.cross_fit(
+        drawn.values,
+        drawn.label,
+        drawn.place,
         kernel=kernel,
-        C=settings.C,
-        gamma=settings.gamma,
+        C=C,
+        gamma=gamma,
         folds=settings.folds,
         seed=settings.seed,
     )
+    machine = found.machine
+    of_kernel = gamma if kernel == "rbf" else None
+    return machine, HeldOut(drawn.at(found.rows), found.posterior, machine.held_out, C, of_kernel, trials)
 
 
-def _place(row: NDArray[Any], col: NDArray[Any], number: int, side: int) -> NDArray[np.intp]:
-    """A number for each square of `side` pixels of each capture."""
-    place: NDArray[np.intp] = ((number * 1000 + row // side) * 1000 + col // side).astype(np.intp)
-    return place
+def _fit_naive_bayes(drawn: Samples, settings: TrainingSettings) -> tuple[Classifier, HeldOut]:
+    fold, by = deal_folds(drawn.label, drawn.place, settings.folds, settings.seed)
+    posterior = np.empty((len(drawn.label), int(drawn.label.max()) + 1))
+    for part in np.unique(fold):
+        others = drawn.at(np.flatnonzero(fold != part))
+        without = naive_bayes.train(others.values, others.label)
+        posterior[fold == part] = without.posterior(drawn.values[fold == part])
+    classifier = naive_bayes.train(drawn.values, drawn.label)
+    return classifier, HeldOut(drawn, posterior, by, None, None, ())
 
 
-def _every_class_has_samples(labels: NDArray[np.intp], classes: SurfaceClasses, what: str) -> None:
-    lacking = [name for number, name in enumerate(classes.names) if not (labels == number).any()]
+def _every_class_has_samples(drawn: Samples, classes: SurfaceClasses, what: str) -> None:
+    lacking = [name for number, name in enumerate(classes.names) if not (drawn.label == number).any()]
     if lacking:
         raise InputError(f"the training captures have no {what} of {', '.join(lacking)}")

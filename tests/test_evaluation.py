@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from surfclass.evaluation import Benchmark, calibration_error, score, score_layers
+from surfclass.classifiers.reliability import calibration_error
+from surfclass.evaluation import Benchmark, score, score_layers
 from surfclass.voxel_map import MapLayers
 
 P = np.array([[0.8, 0.1, 0.1], [0.2, 0.7, 0.1], [0.5, 0.3, 0.2], [0.1, 0.1, 0.8]], np.float32)

@@ -27,7 +27,9 @@ from surfclass.rig import Lens, Response, TextureLimits, parse_classes, parse_ri
 from surfclass.training import TrainingSettings, response_samples, train
 
 SCALE = 0.25
-SMALL = TrainingSettings(pixels_per_class=300, windows_per_class=200, window_px=10, place_px=20)
+SMALL = TrainingSettings(
+    pixels_per_class=300, windows_per_class=200, window_px=10, place_px=20, C=1.0, gamma=1.0
+)
 
 
 def captured(world, name, role, dark=False):

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surfclass.classifiers.coupling import couple_planes
-from surfclass.classifiers.folds import HeldOut, deal_folds, thin_out
+from surfclass.classifiers.folds import HeldOut, Index, deal_folds, thin_out
 from surfclass.classifiers.platt import fit_sigmoid, sigmoid
 from surfclass.classifiers.samples import check_features, check_samples
 from surfclass.errors import InputError
-from surfclass.types import Float32, Float64, freeze
+from surfclass.types import Bool, Float32, Float64, freeze
 
 Kernel = Literal["rbf", "linear"]
 
@@ -188,6 +188,21 @@ class Svm:
         return cls(**values)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossFit:
+    """A machine, and what was said of each of its samples without having seen the sample's place.
+
+    Attributes:
+        machine: Fitted to all samples.
+        rows: (m,) which of the samples were used.
+        posterior: (m, k) by machines and sigmoids that were fitted without the sample's fold.
+    """
+
+    machine: Svm
+    rows: Index
+    posterior: Float64
+
+
 def train(
     x: NDArray[np.floating],
     label: NDArray[np.integer],
@@ -201,6 +216,30 @@ def train(
     names: Sequence[str] | None = None,
     most_samples: int = 16_000,
 ) -> Svm:
+    """Returns the machine of `cross_fit`, whose arguments these are.
+
+    Raises:
+        InputError: As `cross_fit`.
+    """
+    return cross_fit(
+        x, label, groups, kernel=kernel, C=C, gamma=gamma, folds=folds, seed=seed, names=names,
+        most_samples=most_samples,
+    ).machine  # fmt: skip
+
+
+def cross_fit(
+    x: NDArray[np.floating],
+    label: NDArray[np.integer],
+    groups: NDArray[Any],
+    *,
+    kernel: Kernel = "rbf",
+    C: float = 10.0,
+    gamma: float = 1.0,
+    folds: int = 5,
+    seed: int = 0,
+    names: Sequence[str] | None = None,
+    most_samples: int = 16_000,
+) -> CrossFit:
     """Returns a machine fitted to samples, with sigmoids fitted to samples that were held out.
 
     More than `most_samples` are thinned out evenly: on overlapping classes the support vectors grow
@@ -237,7 +276,7 @@ def train(
     constant = deviation <= 1e-12 * np.maximum(1, np.abs(mean))
     scale = np.where(constant, 1.0, deviation)
 
-    def fit(rows: NDArray[np.bool_]) -> Svm:
+    def fit(rows: Bool) -> Svm:
         support, coefficient, intercept = _fit_pairs((x[rows] - mean) / scale, y[rows], kernel, C, gamma)
         one = np.ones(len(intercept))
         return Svm(
@@ -248,12 +287,24 @@ def train(
     f = np.empty((len(y), int(y.max()) * (int(y.max()) + 1) // 2))
     for part in np.unique(fold):
         f[fold == part] = fit(fold != part).decision(x[fold == part])
-    sigmoids = []
+    A, B = _fit_sigmoids(f, y)
+    machine = replace(fit(np.ones(len(y), dtype=np.bool_)), A=A, B=B)
+    posterior = np.empty((len(y), machine.prior.size))
+    for part in np.unique(fold):
+        inside = fold == part
+        A, B = _fit_sigmoids(f[~inside], y[~inside])
+        posterior[inside] = replace(machine, A=A, B=B)._couple(f[inside].T).T
+    return CrossFit(machine, chosen, posterior)
+
+
+def _fit_sigmoids(f: Float64, y: Index) -> tuple[Float64, Float64]:
+    """(pairs,) slopes and offsets from (n, pairs) decisions on samples that were held out."""
+    found = []
     for pair, (i, j) in enumerate(combinations(range(int(y.max()) + 1), 2)):
         of_pair = (y == i) | (y == j)
-        sigmoids.append(fit_sigmoid(f[of_pair, pair], y[of_pair] == i))
-    A, B = np.array(sigmoids).T
-    return replace(fit(np.ones(len(y), dtype=np.bool_)), A=A, B=B)
+        found.append(fit_sigmoid(f[of_pair, pair], y[of_pair] == i))
+    A, B = np.array(found).T
+    return A, B
 
 
 def _fit_pairs(
