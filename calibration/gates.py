@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from pydantic import Field
+
 from surfclass.schema import Positive, Table
 
 
@@ -12,21 +16,49 @@ class CamerasGates(Table):
 
 
 class HandEyeGates(Table):
-    """Of `calibrate hand-eye`."""
+    """Of `calibrate hand-eye`.
 
-    translation_sd_m: Positive = 0.001
+    Attributes:
+        translation_sd_m: Standard deviation of the transform's translation along its worst axis.
+        rotation_sd_rad: Likewise of its rotation about its worst axis.
+        leave_one_out_px: Rms over the pixels of each pose, predicted by the other poses.
+        leave_one_out_m: Likewise of points that were measured in space.
+        outlier_poses: So many poses may not fit and be left out.
+    """
+
+    translation_sd_m: Positive = 0.002
+    rotation_sd_rad: Positive = 0.003
+    leave_one_out_px: Positive = 3.0
+    leave_one_out_m: Positive = 0.005
+    outlier_poses: Annotated[int, Field(ge=0)] = 0
 
 
 class LightGates(Table):
-    """Of `calibrate light`."""
+    """Of `calibrate light`.
+
+    Attributes:
+        position_sd_m: Of the light's position: the longest half-axis of its ellipsoid of one standard deviation.
+        k_d_variation: Standard deviation over mean of K_d, over all pixels of targets that are of one K_d.
+        held_out: Rms of the relative error of a left-out view's light, up to its K_d.
+    """
 
     position_sd_m: Positive = 0.010
+    k_d_variation: Positive = 0.03
+    held_out: Positive = 0.02
 
 
 class ResponseGates(Table):
-    """Of `calibrate response`."""
+    """Of `calibrate response`.
 
-    rms: Positive = 0.01
+    Attributes:
+        held_out: Rms error of predicting a left-out exposure (or view) from the others, of full scale.
+        curve_sd: Rms standard deviation of g⁻¹ over the intensities that were seen, relative to g⁻¹.
+        least_range: The intensities that were seen must cover this share of full scale.
+    """
+
+    held_out: Positive = 0.01
+    curve_sd: Positive = 0.02
+    least_range: Positive = 0.5
 
 
 class LimitsGates(Table):
@@ -36,9 +68,29 @@ class LimitsGates(Table):
 
 
 class VerifyGates(Table):
-    """Of `verify`."""
+    """Of `verify`.
 
-    point_m: Positive = 0.003
+    Attributes:
+        point_rms_m: Rms distance of a disc, seen from a new pose, from where it was touched.
+        point_max_m: The greatest such distance.
+        k_d_variation: Standard deviation over mean of a grey card's K_d, over all places of all captures.
+        k_d_between: The same between the captures' means.
+        accuracy: Share of labelled pixels that the model must get right.
+        class_accuracy: The same of the worst class.
+        reprojection_px: Rms distance of a board's corners in the IR image from the board's pose.
+        transfer_px: The same in the colour image, from the pose that the IR image gives.
+        depth_error: Relative error of depth on the board.
+    """
+
+    point_rms_m: Positive = 0.003
+    point_max_m: Positive = 0.010
+    k_d_variation: Positive = 0.03
+    k_d_between: Positive = 0.02
+    accuracy: Annotated[Positive, Field(le=1)] = 0.85
+    class_accuracy: Annotated[Positive, Field(le=1)] = 0.70
+    reprojection_px: Positive = 0.5
+    transfer_px: Positive = 1.5
+    depth_error: Positive = 0.01
 
 
 class Gates(Table):

@@ -6,79 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.hand_eye.adjustment_columns import (
-    Free,
-    Layout,
-    Rows,
-    State,
-    layout,
-    moved,
-    pixel_rows,
-    position_rows,
-    probed_rows,
-)
+from calibration.hand_eye.adjustment_columns import Free, Layout, State, layout, moved
+from calibration.hand_eye.normal_equations import Noise, Normal, inverse_of, system_of
 from calibration.hand_eye.problem import Problem
 from surfclass.types import Bool, Float64
 
-_CAUCHY = 25.0  # square of the Cauchy loss's width, in standard deviations of a single number
 _MOST_STEPS = 60
 _STEP = 1e-11  # rad and m: a step of the hand-eye transform below this ends the iteration
-_NULL = 1e-13  # of the normal matrix's greatest eigenvalue; what lies below is not determined
 _HALVINGS = 8
 _OWN_STEPS = 5
-
-
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Standard deviations.
-
-    Attributes:
-        pixel: px, of each coordinate of a pixel with `sd_px` 1.
-        across: m, of a position with `sd_m` 1 across its ray.
-        along: m, likewise along it.
-        probed: Factor on the probed points' own.
-        turn: rad, of an arm's pose about each axis; with joint angles: of each joint.
-        shift: m, of an arm's pose along each axis; unused with joint angles.
-    """
-
-    pixel: float = 0.3
-    across: float = 3e-4
-    along: float = 1e-3
-    probed: float = 1.0
-    turn: float = 2e-4
-    shift: float = 2e-4
-
-    def deviation(self, joints: bool) -> Float64:
-        """(6,) of a pose's deviation."""
-        return np.array([self.turn] * 6 if joints else [self.turn] * 3 + [self.shift] * 3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Normal:
-    """Normal equations of one group of rows.
-
-    Attributes:
-        global_: (g, g).
-        cross: (n, g, 6) for each pose.
-        deviation: (n, 6, 6).
-        right_global: (g,).
-        right_deviation: (n, 6).
-    """
-
-    global_: Float64
-    cross: Float64
-    deviation: Float64
-    right_global: Float64
-    right_deviation: Float64
-
-    def __add__(self, other: Normal) -> Normal:
-        return Normal(
-            self.global_ + other.global_,
-            self.cross + other.cross,
-            self.deviation + other.deviation,
-            self.right_global + other.right_global,
-            self.right_deviation + other.right_deviation,
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,13 +65,13 @@ def adjust(problem: Problem, start: State, free: Free, noise: Noise, keep: Bool)
     places = layout(problem, free)
     deviation = np.where(keep[:, None], start.deviation, 0.0) if free.deviations else 0 * start.deviation
     state = replace(start, deviation=deviation)
-    system = _system(problem, state, free, places, noise, keep)
+    system = system_of(problem, state, free, places, noise, keep)
     for _ in range(_MOST_STEPS):
         step, deviations = system.step()
         factor = 1.0
         for _ in range(_HALVINGS):
             ahead = moved(state, free, places, factor * step, state.deviation + factor * deviations)
-            trial = _system(problem, ahead, free, places, noise, keep)
+            trial = system_of(problem, ahead, free, places, noise, keep)
             if trial.cost <= system.cost * (1 + 1e-12) + 1e-12:
                 break
             factor /= 2
@@ -144,7 +80,7 @@ def adjust(problem: Problem, start: State, free: Free, noise: Noise, keep: Bool)
         state, system = ahead, trial
         if np.abs(factor * step[places.x]).max() < _STEP:
             break
-    inverse = _inverse(system.reduced)
+    inverse = inverse_of(system.reduced)
     share = inverse @ system.groups["probed"].global_ @ inverse / noise.probed**2
     return Fit(
         state,
@@ -176,150 +112,7 @@ def deviations_of(problem: Problem, state: State, noise: Noise, weights: tuple[F
     places = layout(problem, free)
     held = replace(state, deviation=0 * state.deviation)
     for _ in range(_OWN_STEPS):
-        system = _system(problem, held, free, places, noise, keep, weights)
+        system = system_of(problem, held, free, places, noise, keep, weights)
         step = np.einsum("nij,nj->ni", system.inner, system.total.right_deviation)
         held = replace(held, deviation=held.deviation + step)
     return held.deviation
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _System:
-    total: Normal
-    inner: Float64  # (n, 6, 6) inverses of the deviations' own blocks
-    reduced: Float64
-    cost: float
-    groups: dict[str, Normal]
-    squares: dict[str, tuple[float, float]]
-    pixel_weight: Float64
-    position_weight: Float64
-
-    def step(self) -> tuple[Float64, Float64]:
-        total = self.total
-        eliminated = np.einsum("ngi,nij,nj->g", total.cross, self.inner, total.right_deviation)
-        step = _inverse(self.reduced) @ (total.right_global - eliminated)
-        left = total.right_deviation - np.einsum("ngi,g->ni", total.cross, step)
-        return step, np.einsum("nij,nj->ni", self.inner, left)
-
-
-def _system(
-    problem: Problem,
-    state: State,
-    free: Free,
-    places: Layout,
-    noise: Noise,
-    keep: Bool,
-    weights: tuple[Float64, Float64] | None = None,
-) -> _System:
-    poses, size = problem.poses, places.size
-    groups: dict[str, Normal] = {}
-    squares: dict[str, tuple[float, float]] = {}
-    cost = 0.0
-    pixel_weight, position_weight = np.zeros(0), np.zeros(0)
-    if len(problem.pixels.pose):
-        rows = pixel_rows(problem, state, free, places)
-        unit = np.ones((len(rows.pose), 2)) / (rows.sd * noise.pixel)[:, None]
-        pixel_weight, loss = _robust(rows.residual * unit, unit > 0, keep[rows.pose])
-        pixel_weight = pixel_weight if weights is None else weights[0]
-        cost += loss
-        groups["pixel"], squares["pixel"] = _normal(rows, pixel_weight, np.ones(2, np.bool_), poses)
-    if len(problem.positions.pose):
-        rows = position_rows(problem, state, free, places)
-        used = np.ones((len(rows.pose), 3), np.bool_)
-        used[:, :2] = problem.new_across[:, None]
-        sd = np.array([noise.across, noise.across, noise.along])
-        whitened = rows.residual / (rows.sd[:, None] * sd)
-        position_weight, loss = _robust(whitened, used, keep[rows.pose])
-        position_weight = position_weight if weights is None else weights[1]
-        cost += loss
-        across = position_weight * problem.new_across
-        groups["across"], squares["across"] = _normal(rows, across, np.array([True, True, False]), poses)
-        groups["along"], squares["along"] = _normal(
-            rows, position_weight, np.array([False, False, True]), poses
-        )
-    groups["probed"], squares["probed"] = _probed(problem, state, places)
-    cost += squares["probed"][0] / noise.probed**2
-    scales = {"pixel": noise.pixel, "across": noise.across, "along": noise.along, "probed": noise.probed}
-    total = _nothing(poses, size)
-    for name, group in groups.items():
-        total = total + _scaled(group, 1 / scales[name] ** 2)
-    if not free.deviations:
-        total = replace(total, cross=0 * total.cross, right_deviation=0 * total.right_deviation)
-    sd = noise.deviation(problem.jacobian is not None)
-    inner = np.asarray(np.linalg.inv(total.deviation + np.diag(1 / sd**2)), np.float64)
-    total = replace(total, right_deviation=total.right_deviation - state.deviation / sd**2)
-    cost += float(np.sum((state.deviation / sd) ** 2))
-    reduced: Float64 = total.global_ - np.einsum("ngi,nij,nhj->gh", total.cross, inner, total.cross)
-    return _System(total, inner, reduced, cost, groups, squares, pixel_weight, position_weight)
-
-
-def _robust(whitened: Float64, used: Bool, keep: Bool) -> tuple[Float64, float]:
-    """Cauchy weights (n,) by the mean square of each point's numbers, and the loss."""
-    count = used.sum(axis=1)
-    square = np.sum(np.where(used, whitened, 0) ** 2, axis=1) / np.maximum(count, 1)
-    weight = np.where(keep, 1 / (1 + square / _CAUCHY), 0.0)
-    loss = _CAUCHY * np.log1p(square / _CAUCHY) * count
-    return weight, float(np.sum(loss[keep]))
-
-
-def _normal(rows: Rows, weight: Float64, which: Bool, poses: int) -> tuple[Normal, tuple[float, float]]:
-    """The normal equations of some of the columns of each point's residual, by unit noise."""
-    root = (np.sqrt(weight) / rows.sd)[:, None]
-    residual = rows.residual[:, which] * root
-    by_global = rows.by_global[:, which] * root[..., None]
-    by_deviation = rows.by_deviation[:, which] * root[..., None]
-    size = by_global.shape[2]
-    flat, right = by_global.reshape(-1, size), residual.ravel()
-    cross, deviation = np.zeros((poses, size, 6)), np.zeros((poses, 6, 6))
-    right_deviation = np.zeros((poses, 6))
-    ends = np.searchsorted(rows.pose, np.arange(poses + 1))
-    for pose in range(poses):
-        part = slice(int(ends[pose]), int(ends[pose + 1]))
-        own = by_deviation[part].reshape(-1, 6)
-        cross[pose] = by_global[part].reshape(-1, size).T @ own
-        deviation[pose] = own.T @ own
-        right_deviation[pose] = own.T @ residual[part].ravel()
-    count = float(np.sum(weight) * which.sum())
-    normal = Normal(flat.T @ flat, cross, deviation, flat.T @ right, right_deviation)
-    return normal, (float(right @ right), count)
-
-
-def _probed(problem: Problem, state: State, places: Layout) -> tuple[Normal, tuple[float, float]]:
-    nothing = _nothing(problem.poses, places.size)
-    if not len(problem.probed):
-        return nothing, (0.0, 0.0)
-    residual, columns = probed_rows(problem, state, places)
-    right = (residual / problem.fixed_sd[:, None]).ravel()
-    rows = (columns / problem.fixed_sd[:, None, None]).reshape(-1, places.size)
-    normal = replace(nothing, global_=rows.T @ rows, right_global=rows.T @ right)
-    return normal, (float(right @ right), float(len(right)))
-
-
-def _nothing(poses: int, size: int) -> Normal:
-    return Normal(
-        np.zeros((size, size)),
-        np.zeros((poses, size, 6)),
-        np.zeros((poses, 6, 6)),
-        np.zeros(size),
-        np.zeros((poses, 6)),
-    )
-
-
-def _scaled(normal: Normal, factor: float) -> Normal:
-    return Normal(
-        factor * normal.global_,
-        factor * normal.cross,
-        factor * normal.deviation,
-        factor * normal.right_global,
-        factor * normal.right_deviation,
-    )
-
-
-def _inverse(matrix: Float64) -> Float64:
-    """The inverse over what is determined: parameters are scaled to a unit diagonal first."""
-    diagonal = np.sqrt(np.maximum(np.diag(matrix), 0))
-    scale = np.where(diagonal > 0, 1 / np.maximum(diagonal, 1e-300), 0.0)
-    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
-    kept = values > _NULL * max(float(values[-1]), 1e-300)
-    inverse: Float64 = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    inverse *= np.outer(scale, scale)
-    return inverse

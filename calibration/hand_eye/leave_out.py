@@ -8,11 +8,13 @@ import numpy as np
 
 from calibration.hand_eye.adjustment import Fit, adjust, deviations_of
 from calibration.hand_eye.adjustment_columns import Free, State, layout, pixel_rows, position_rows, twists
+from calibration.hand_eye.normal_equations import Noise
 from calibration.hand_eye.problem import Problem
 from calibration.resampling import jackknife_covariance
 from calibration.rotations import difference, six_of
 from surfclass.types import Bool, Float64, Transform
 
+_FREE = Noise(turn=10.0, shift=10.0)
 _GONE = 0.1  # of a robust weight: a point below it is a mistake, and no figure counts it
 
 
@@ -87,6 +89,8 @@ def left_out(problem: Problem, fit: Fit) -> LeftOut:
         position[problem.positions.pose == pose] = predicted.position[problem.positions.pose == pose]
         own = deviations_of(problem, without.state, fit.noise, weights)
         surprise[pose] = np.mean((own[pose] / sd) ** 2)
+        if not fit.keep[pose]:  # one that is wrong is not held back by how good the others are
+            own = deviations_of(problem, without.state, _FREE, weights)
         deviation[pose] = twists(problem, own)[pose]
     return LeftOut(
         Misses(pixel, position),

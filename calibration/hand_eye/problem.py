@@ -27,7 +27,7 @@ class Seen:
         pose: (n,) index of the view in canonical order.
         point: (n,) index into `Problem.target`.
         value: (n, 2) px or (n, 3) m in the camera's frame.
-        sd: (n,) relative.
+        sd: (n,) in the middle one's.
     """
 
     pose: NDArray[np.intp]
@@ -166,7 +166,9 @@ def _gathered(
         points.append(which[order])
         values.append(value[order])
         sds.append(sd[order])
-    return Seen(np.concatenate(poses), np.concatenate(points), np.concatenate(values), np.concatenate(sds))
+    sd = np.concatenate(sds)
+    level = float(np.median(sd)) if len(sd) else 1.0
+    return Seen(np.concatenate(poses), np.concatenate(points), np.concatenate(values), sd / level)
 
 
 def _arm(views: list[View], flange_offset_m: float) -> tuple[Float64 | None, Float64 | None]:

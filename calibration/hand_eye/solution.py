@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.hand_eye.adjustment import Fit, Noise, adjust, deviations_of
+from calibration.hand_eye.adjustment import Fit, adjust, deviations_of
 from calibration.hand_eye.adjustment_columns import Free, State
 from calibration.hand_eye.arm_offsets import ArmOffsets, free_offsets
 from calibration.hand_eye.intrinsics import ESTIMATED, estimate_intrinsics
 from calibration.hand_eye.leave_out import LeftOut, in_outer_frame, left_out, whole_points
+from calibration.hand_eye.normal_equations import Noise
 from calibration.hand_eye.observability import motion_faults, open_directions, target_fault
 from calibration.hand_eye.observations import Observations
 from calibration.hand_eye.problem import Problem, problem_of

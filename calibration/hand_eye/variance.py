@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.hand_eye.adjustment import Fit, Noise, adjust
+from calibration.hand_eye.adjustment import Fit, adjust
 from calibration.hand_eye.adjustment_columns import Free, State
+from calibration.hand_eye.normal_equations import Noise
 from calibration.hand_eye.problem import Problem
 from surfclass.types import Bool
 
