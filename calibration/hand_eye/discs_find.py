@@ -21,7 +21,7 @@ from surfclass.types import Bool, Float32, Float64
 _RING = (1.3, 2.3)  # of the radius
 _CORE = 0.85
 _LEAST_RADIUS_PX = 4.0
-_SIZE = (0.5, 1.7)  # of a blob against the disc's, before its outline is known
+_SIZE = (0.55, 1.7)  # of a blob against the disc's, before its outline is known
 _RADIUS_SHARE = 0.15
 _RADIUS_PX = 1.5
 _SPREAD_PX = 0.5
@@ -111,7 +111,7 @@ class _Look:
         near = window.inverse[(reach < _RING[1]) & (window.inverse > 0)]
         if len(near):  # most of what is bright but no disc goes without a plane being fitted
             ratio = longer / (self._camera.fx * self._radius_m * float(np.median(near)))
-            if not 0.7 * _SIZE[0] < ratio < 1.4 * _SIZE[1]:
+            if not 0.9 * _SIZE[0] < ratio < 1.2 * _SIZE[1]:
                 return self._wrong_radius(ratio)
         plane = self._plane(window, reach, blob, blobs)
         if isinstance(plane, str):

@@ -14,7 +14,8 @@ from surfclass.types import Float64
 _LEVELS = 12  # thresholds between the background and the brightest, evenly spaced in their logarithm
 _KERNELS = (3, 5, 7, 9, 11, 13)
 _LEAST_AREA_PX = 30
-_SPECK_PX = 12  # what a median leaves of a dot of the projector's pattern, at most
+_SPECK = 0.3  # of the smallest disc's area, below which a piece is speckle
+_KERNEL = 1.3  # of the smallest disc's radius: a median of 2.5 of it would take the disc away
 _VERY_ROUND = 0.93  # of 1, which an ellipse has
 ROUND = 0.80
 """Share of its ellipse's area below which a blob is certainly no disc."""
@@ -84,7 +85,7 @@ def find_blobs(ir: NDArray[Any], smallest_px: float, largest_px: float) -> list[
         smallest_px: Radius of the farthest disc that there can be; what is much smaller is not returned.
         largest_px: Of the nearest; what is much larger is not returned either.
     """
-    image, counts = _despeckled(ir, largest_px)
+    image, counts = _despeckled(ir, smallest_px)
     low, high = _range(image)
     found: list[Blob] = []
     if high <= low:
@@ -95,7 +96,7 @@ def find_blobs(ir: NDArray[Any], smallest_px: float, largest_px: float) -> list[
     return [blob for blob in _best(found) if blob.roundness >= ROUND or blob.level >= middle]
 
 
-def _despeckled(ir: NDArray[Any], largest_px: float) -> tuple[NDArray[np.uint8], float]:
+def _despeckled(ir: NDArray[Any], smallest_px: float) -> tuple[NDArray[np.uint8], float]:
     """Returns the median-filtered image in 8 bits, and how many of the counts one of its levels is.
 
     Whether specks are left is asked halfway (in the logarithm) between the background and the brightest.
@@ -105,13 +106,13 @@ def _despeckled(ir: NDArray[Any], largest_px: float) -> tuple[NDArray[np.uint8],
     eight = np.clip(np.round(ir / counts), 0, 255).astype(np.uint8)
     filtered = eight
     for size in _KERNELS:
-        if size > max(3.0, 0.8 * largest_px):
+        if size > max(3.0, _KERNEL * smallest_px):
             break
         filtered = np.asarray(cv2.medianBlur(eight, size), np.uint8)
         low, high = _range(filtered)
         binary = (filtered > _middle(low, high)).astype(np.uint8)
         count, _, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=4)
-        if not (stats[1:count, cv2.CC_STAT_AREA] <= _SPECK_PX).any():
+        if not (stats[1:count, cv2.CC_STAT_AREA] < _SPECK * np.pi * smallest_px**2).any():
             break
     return filtered, counts
 
@@ -194,16 +195,21 @@ def _parted(contour: NDArray[Any], shape: tuple[int, ...], level: float) -> list
 
 def _best(blobs: list[Blob]) -> list[Blob]:
     """Keeps the roundest blob of each place; of those alike, that of the lowest threshold."""
-    kept: list[Blob] = []
-    for blob in sorted(blobs, key=lambda b: (-min(b.roundness, _VERY_ROUND), b.level, tuple(b.pixel))):
-        if all(_apart(blob, other) for other in kept):
-            kept.append(blob)
-    return kept
-
-
-def _apart(blob: Blob, other: Blob) -> bool:
-    """Whether two blobs are two places: neither centre lies within the other's core."""
-    (x, y), (u, v) = blob.pixel.tolist(), other.pixel.tolist()
-    if max(abs(x - u), abs(y - v)) > 4 * max(blob.covariance.max(), other.covariance.max()) ** 0.5:
-        return True
-    return bool(blob.reach(u, v) > _SAME_PLACE and other.reach(x, y) > _SAME_PLACE)
+    ranked = sorted(blobs, key=lambda b: (-min(b.roundness, _VERY_ROUND), b.level, tuple(b.pixel)))
+    if not ranked:
+        return []
+    centre = np.array([blob.pixel for blob in ranked])
+    spread = np.array([blob.covariance for blob in ranked])
+    away = centre[None] - centre[:, None]  # of j from i
+    squared = (
+        spread[:, None, 1, 1] * away[..., 0] ** 2
+        - 2 * spread[:, None, 0, 1] * away[..., 0] * away[..., 1]
+        + spread[:, None, 0, 0] * away[..., 1] ** 2
+    ) / (4 * np.linalg.det(spread)[:, None])
+    within = squared <= _SAME_PLACE**2  # the centre of j within the core of i
+    same = within | within.T
+    kept: list[int] = []
+    for number in range(len(ranked)):
+        if not same[number, kept].any():
+            kept.append(number)
+    return [ranked[number] for number in kept]

@@ -20,6 +20,7 @@ _FIRST_WINDOW = 0.4  # of the radius
 _LEVEL = 0.25  # of the way from the background to the disc's darker places
 _DARKER = 0.15  # share of the disc's pixels that are darker still: speckle has deep gaps
 _NOISE_SD = 3.5
+_HIGHEST = 0.6
 _SPREAD_PX = 0.5  # outwards: where an edge of 0.5 to 1 px falls to that level
 _SPREAD_SD_PX = 1.0
 _TUKEY = 4.685
@@ -143,7 +144,7 @@ def _round(
         return "cut off by the image's border"
     offset, seen = _edges(image, at, normal, reach, centre, basis, radius_m, camera)
     if seen.sum() < max(12, 0.4 * count):
-        return f"no edge along {100 * (1 - seen.mean()):.0f} % of its outline"
+        return "no edge where a disc's outline would be"
     edge = at + offset[:, None] * normal
     flat = (plane.meet(tangents_at(edge, camera)) - centre) @ basis.T
     distance = np.linalg.norm(flat, axis=1)
@@ -179,9 +180,9 @@ def _edges(
     dark = sampled(image, beyond[:, 0], beyond[:, 1])
     base = float(np.median(dark))
     noise = 1.4826 * float(np.median(np.abs(dark - base)))
-    level = base + max(_LEVEL * (bright - base), _NOISE_SD * noise)
-    if level >= bright:
+    if bright - base < 2 * noise:
         return np.zeros(len(at)), np.zeros(len(at), bool)
+    level = base + min(max(_LEVEL * (bright - base), _NOISE_SD * noise), _HIGHEST * (bright - base))
     above = profile > level
     last = profile.shape[1] - 1 - above[:, ::-1].argmax(axis=1)
     seen = above.any(axis=1) & (last < profile.shape[1] - 1)
