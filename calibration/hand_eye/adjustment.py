@@ -12,7 +12,8 @@ from calibration.hand_eye.problem import Problem
 from surfclass.types import Bool, Float64
 
 _MOST_STEPS = 60
-_STEP = 1e-11  # rad and m: a step of the hand-eye transform below this ends the iteration
+_STEP = 1e-10  # rad and m: a step of the hand-eye transform below this ends the iteration
+_COST = 1e-9  # relative and absolute: what the cost may rise by rounding
 _HALVINGS = 8
 _OWN_STEPS = 5
 
@@ -72,7 +73,7 @@ def adjust(problem: Problem, start: State, free: Free, noise: Noise, keep: Bool)
         for _ in range(_HALVINGS):
             ahead = moved(state, free, places, factor * step, state.deviation + factor * deviations)
             trial = system_of(problem, ahead, free, places, noise, keep)
-            if trial.cost <= system.cost * (1 + 1e-12) + 1e-12:
+            if trial.cost <= system.cost * (1 + _COST) + _COST:
                 break
             factor /= 2
         else:
