@@ -37,7 +37,7 @@ class LightGates(Table):
     """Of `calibrate light`.
 
     Attributes:
-        position_sd_m: Of the light's position: the longest half-axis of its ellipsoid of one standard deviation.
+        position_sd_m: Standard deviation of the light's position along its most uncertain direction.
         k_d_variation: Standard deviation over mean of K_d, over all pixels of targets that are of one K_d.
         held_out: Rms of the relative error of a left-out view's light, up to its K_d.
     """
@@ -84,11 +84,11 @@ class VerifyGates(Table):
 
     point_rms_m: Positive = 0.003
     point_max_m: Positive = 0.010
-    k_d_variation: Positive = 0.03
-    k_d_between: Positive = 0.02
+    k_d_variation: Positive = 0.02
+    k_d_between: Positive = 0.015
     accuracy: Annotated[Positive, Field(le=1)] = 0.85
     class_accuracy: Annotated[Positive, Field(le=1)] = 0.70
-    reprojection_px: Positive = 0.5
+    reprojection_px: Positive = 1.0
     transfer_px: Positive = 1.5
     depth_error: Positive = 0.01
 
