@@ -101,6 +101,17 @@ class Double:
                 raise AssertionError(deed)
 
 
+class ExposingDouble(Double):
+    """One whose exposure can be changed; the options `range_s` and `took` are what it says of it."""
+
+    def exposure_range_s(self):
+        return self.options.get("range_s", [0.001, 0.1])
+
+    def set_exposure(self, exposure_s):
+        self.does("set_exposure")
+        return self.options.get("took", exposure_s)
+
+
 def talk(packet):
     """Sends a packet on the socket to the parent."""
     for descriptor in range(3, 64):
@@ -121,6 +132,11 @@ def camera(*, name, clock, options, shared):
     """The factory."""
     assert shared == {}
     return Double(name, clock, options)
+
+
+def exposing(*, name, clock, options, shared):
+    """The factory of one whose exposure can be changed."""
+    return ExposingDouble(name, clock, options)
 
 
 def needs_a_library(*, name, clock, options, shared):

@@ -98,6 +98,36 @@ def test_exposure_and_gain_of_the_client_change_the_light(scene, emulated):
     assert means[4000.0, 6.0] / means[4000.0, 0.0] == pytest.approx(10**0.3, rel=0.01)
 
 
+@pytest.mark.parametrize("trigger", [{"trigger": "software"}, {"trigger": "free", "rate_hz": 40.0}])
+def test_an_exposure_that_is_set_is_that_of_the_next_frame_and_of_all_after_it(scene, emulated, trigger):
+    with client(pixel_format="BayerRG16", **trigger) as camera:
+        began_ns = time.monotonic_ns()
+        before = grab(camera)
+        light_per_s = before.rgb.mean() / before.exposure_s
+        for exposure_s in (0.012, 0.003, 0.0031, 0.012):
+            assert camera.set_exposure(exposure_s) == pytest.approx(exposure_s)
+            for _ in range(2):
+                frame = camera.grab(began_ns, 3.0)
+                assert frame.exposure_s == pytest.approx(exposure_s)
+                assert frame.rgb.mean() / exposure_s == pytest.approx(light_per_s, rel=0.005)
+        assert "exposure 12.000 ms" in camera.about()["settings"]
+
+
+def test_a_camera_whose_exposure_was_set_is_not_taken_for_one_that_was_reset(scene, emulated):
+    with client() as camera:
+        camera.set_exposure(0.007)
+        time.sleep(0.7)  # it has been looked after meanwhile
+        camera.check()
+        assert grab(camera).exposure_s == pytest.approx(0.007)
+
+
+def test_an_exposure_that_the_camera_does_not_allow_is_refused_with_what_it_does(scene, emulated):
+    with client() as camera:
+        with pytest.raises(InputError, match=r"this camera allows 29 to 3e\+07"):
+            camera.set_exposure(1e-6)
+        assert grab(camera).exposure_s == 0.005
+
+
 def test_a_region_is_a_part_of_the_whole_pixel_by_pixel(scene, emulated):
     with client(region=(8, 6, 16, 10)) as camera:
         rgb = grab(camera).rgb

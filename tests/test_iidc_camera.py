@@ -20,8 +20,8 @@ from drivers.bayer import demosaic
 from drivers.clock import SystemClock
 from drivers.colour_iidc import colour
 from drivers.emulators.firefly_registers import GAIN, GAMMA, SHUTTER, WHITE_BALANCE
-from drivers.errors import DeviceLostError, DeviceTimeoutError
-from drivers.isolation.camera import IsolatedCamera
+from drivers.errors import DeviceFaultError, DeviceLostError, DeviceTimeoutError
+from drivers.isolation.colour import IsolatedColourCamera
 from surfclass.errors import ConfigurationError
 
 WAIT_S = 5.0  # for a frame that comes, on a busy computer
@@ -50,7 +50,7 @@ def rig(libusb, tmp_path):
         usb = FireflySocket(tmp_path / f"usb{len(made)}", **firefly)
         usb.plug()
         places = {"LD_LIBRARY_PATH": str(libusb), "IIDC_USB_SOCKET": str(usb.path)}
-        camera = IsolatedCamera(
+        camera = IsolatedColourCamera(
             "drivers.colour_iidc:in_process",
             name="colour",
             options=options,
@@ -295,6 +295,60 @@ class TestTimes:
             usb.camera.edge()
             frame = camera.grab(asked_ns, WAIT_S)
             assert times_hold(frame, usb)
+
+
+def seconds_of(shot):
+    return (shot.end_ns - shot.begin_ns) / 1e9
+
+
+class TestExposures:
+    @pytest.mark.parametrize(
+        "trigger",
+        [{}, {"trigger": "free", "frame_rate_hz": 30.0, "readout_max_s": 0.05}],
+        ids=["software", "free"],
+    )
+    def test_are_as_long_as_they_were_set_from_the_next_frame_on(self, rig, trigger):
+        usb, camera = rig({**SMALL, **trigger})
+        with camera:
+            camera.grab(now_ns(), WAIT_S)
+            began_ns = now_ns() - 1_000_000_000
+            for exposure_s in (0.020, 0.002, 0.009):
+                took_s = camera.set_exposure(exposure_s)
+                assert took_s == pytest.approx(exposure_s, rel=0.03)
+                for _ in range(2):
+                    frame = camera.grab(began_ns, WAIT_S)
+                    assert frame.exposure_s == took_s
+                    assert seconds_of(shot_of(frame, usb)) == pytest.approx(took_s, rel=1e-3)
+                    assert times_hold(frame, usb)
+            assert f"shutter {took_s * 1e3:.3f} ms" in camera.about()["settings"]
+
+    def test_a_frame_that_comes_too_late_is_not_taken_for_one_of_the_new_exposure(self, rig):
+        usb, camera = rig()
+        with camera:
+            camera.grab(now_ns(), WAIT_S)
+            usb.camera.faults.delay_s = 0.4
+            with pytest.raises(DeviceTimeoutError):
+                camera.grab(now_ns(), 0.1)
+            usb.camera.faults.delay_s = 0.0
+            took_s = camera.set_exposure(0.015)
+            frame = camera.grab(0, WAIT_S)
+            assert seconds_of(shot_of(frame, usb)) == pytest.approx(took_s, rel=1e-3)
+            assert "1 too late" in status(camera)
+
+    def test_without_absolute_registers_are_set_by_the_manuals_steps(self, rig):
+        steps = {"shutter_step_us": 50.0, "gain_step_db": 0.05}
+        usb, camera = rig({**SMALL, **steps}, absolute=False)
+        with camera:
+            assert camera.exposure_range_s()[0] == pytest.approx(50e-6)
+            assert camera.set_exposure(0.0071) == pytest.approx(0.0071)
+            assert usb.camera.registers.features[SHUTTER].raw == 142
+
+    def test_that_the_camera_does_not_keep_are_a_fault(self, rig):
+        usb, camera = rig()
+        with camera:
+            usb.camera.faults.stuck = set(range(0, 0x10000, 4))
+            with pytest.raises(DeviceFaultError, match="kept"):
+                camera.set_exposure(0.05)
 
 
 class TestLoss:
