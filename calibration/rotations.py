@@ -30,22 +30,16 @@ def rotation_vector(matrix: NDArray[Any]) -> Float64:
     # By the unit quaternion: of its four forms the one whose divisor is largest.
     trace = np.trace(m, axis1=-2, axis2=-1)
     squares = np.stack([trace, *(2 * m[..., i, i] - trace for i in range(3))], axis=-1) + 1  # 4 q²
-    quaternion = np.empty((*m.shape[:-2], 4))
-    best = squares.argmax(axis=-1)
     off = np.stack([m[..., k, j] - m[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1)
-    for index in np.ndindex(m.shape[:-2]):
-        b, one = best[index], m[index]
-        half = np.sqrt(squares[index][b]) / 2
-        q = np.empty(4)
-        q[b] = half
-        if b == 0:
-            q[1:] = off[index] / (4 * half)
-        else:
-            i, j, k = b - 1, b % 3, (b + 1) % 3
-            q[0] = off[index][i] / (4 * half)
-            q[1 + j] = (one[i, j] + one[j, i]) / (4 * half)
-            q[1 + k] = (one[i, k] + one[k, i]) / (4 * half)
-        quaternion[index] = q if q[0] >= 0 else -q
+    products = np.empty((*m.shape[:-2], 4, 4))  # 4 q qᵀ, of which one row is enough
+    products[..., 0, 1:] = products[..., 1:, 0] = off
+    products[..., 1:, 1:] = m + np.swapaxes(m, -1, -2)
+    for k in range(4):
+        products[..., k, k] = squares[..., k]
+    best = squares.argmax(axis=-1)[..., None]
+    row = np.take_along_axis(products, best[..., None], axis=-2)[..., 0, :]
+    quaternion = row / (2 * np.sqrt(np.take_along_axis(squares, best, axis=-1)))
+    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
     sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, quaternion[..., :1])
     scale = np.where(sine < _SMALL, 2.0, angle / np.where(sine < _SMALL, 1.0, sine))

@@ -49,7 +49,8 @@ def pair_motions(flange: NDArray[Any], target: NDArray[Any]) -> tuple[Float64, F
     f, t = np.asarray(flange, np.float64), np.asarray(target, np.float64)
     if f.shape != t.shape or f.ndim != 3 or f.shape[1:] != (4, 4) or len(f) < 3:
         raise InputError(f"hand-eye: poses {f.shape} and {t.shape}, needed are 3 or more pairs of (n, 4, 4)")
-    first, second = np.triu_indices(len(f), 1)
+    # Each pair both ways: noise makes a motion and its inverse count a little differently.
+    first, second = np.nonzero(~np.eye(len(f), dtype=np.bool_))
     a = np.linalg.inv(f[second]) @ f[first]
     b = t[second] @ np.linalg.inv(t[first])
     turned = np.linalg.norm(rotation_vector(a[:, :3, :3]), axis=1) > _LEAST_TURN_RAD
