@@ -169,7 +169,7 @@ def sample_board(
     plane = board_plane(capture, rig)
     image = capture.colour.rgb
     full = float(np.iinfo(image.dtype).max)
-    on_board = _on_board(capture, rig, plane)
+    shown = on_board(capture, rig, plane)
     side = max(4, image.shape[0] // _ROWS)
     linear = linearised(image, inverse)
     saturated = image.max(axis=2) >= OVER_EXPOSED * full
@@ -179,7 +179,7 @@ def sample_board(
     if reference_s and capture.colour.exposure_s:
         linear = linear * (reference_s / capture.colour.exposure_s)
     x, y = rays(rig.rgb).astype(np.float64)
-    share = _places(on_board[..., None].astype(np.float32), side).mean(axis=1)[:, 0]
+    share = _places(shown[..., None].astype(np.float32), side).mean(axis=1)[:, 0]
     burnt = _places(saturated[..., None], side)[..., 0].any(axis=1)
     lost = _places(dark[..., None], side)[..., 0].mean(axis=1) > 0.05
     pixels = _places(linear, side)
@@ -191,7 +191,7 @@ def sample_board(
     noise = np.sqrt(
         np.mean((steps[:, :, 2:] - 2 * steps[:, :, 1:-1] + steps[:, :, :-2]) ** 2, axis=(1, 2)) / 6
     )
-    total = max(1, int(on_board.sum()))
+    total = max(1, int(shown.sum()))
     return BoardSamples(
         capture.name,
         KIND_OF_ROLE[capture.role],
@@ -201,8 +201,8 @@ def sample_board(
         pixels.mean(axis=1, dtype=np.float64)[good],
         np.asarray(noise[good] / side, np.float64),
         centre[board & burnt],
-        float((saturated & on_board).sum() / total),
-        float((dark & on_board).sum() / total),
+        float((saturated & shown).sum() / total),
+        float((dark & shown).sum() / total),
     )
 
 
@@ -230,7 +230,8 @@ def too_bright(samples: Iterable[BoardSamples]) -> str:
     return "; ".join(bad)
 
 
-def _on_board(capture: Capture, rig: Rig, plane: Plane) -> Bool:
+def on_board(capture: Capture, rig: Rig, plane: Plane) -> Bool:
+    """Returns (h, w) which colour pixels show the plane; small holes in the depth image are closed."""
     registered = register(capture.depth.depth_mm, rig)
     away = np.abs(np.tensordot(plane.normal.astype(np.float32), registered.point, axes=1) - plane.offset)
     near = registered.has_point & (away < 5 * plane.thickness_m + 0.003)
