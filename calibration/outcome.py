@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from surfclass.errors import InputError
 
 SCHEMA = 1
-Kind = Literal["cameras", "hand-eye", "response", "light", "limits", "train"]
+Kind = Literal["cameras", "hand-eye", "response", "light", "limits", "train", "verify"]
 Verdict = Literal["pass", "fail", "refused"]
 Note = Callable[[str], None]
 """Is called with a sentence at each step of long work."""
@@ -68,6 +71,23 @@ class RefusedError(InputError):
         super().__init__("; ".join(reasons))
         self.reasons = reasons
         self.result = result or {}
+
+
+def plain(value: Any) -> Any:
+    """Returns a result's value as what JSON knows: NumPy's numbers and arrays become Python's.
+
+    Raises:
+        ValueError: If a number is not finite: None says that there is none.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(below) for key, below in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(below) for below in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"a result holds {value}")
+    return value
 
 
 def refused(kind: Kind, error: RefusedError) -> Outcome:

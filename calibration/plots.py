@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 _DPI = 110
 
@@ -30,6 +32,18 @@ def drawing(path: Path, rows: int = 1, columns: int = 1, **options: Any) -> Iter
     finally:
         part.unlink(missing_ok=True)
         pyplot.close(figure)
+
+
+def draw_confusion(ax: Any, counts: Sequence[Sequence[int]], names: Sequence[str]) -> None:
+    """Draws a confusion matrix: row by row the shares of each true class, by what it was taken for."""
+    rows = np.array(counts, np.float64)
+    share = rows / np.maximum(rows.sum(axis=1, keepdims=True), 1)
+    ax.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for (row, col), value in np.ndenumerate(share):
+        ink = "white" if value > 0.55 else "black"
+        ax.text(col, row, f"{value:.2f}", ha="center", va="center", color=ink, fontsize=8)
+    ax.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=8)
+    ax.set_yticks(range(len(names)), names, fontsize=8)
 
 
 def _pyplot() -> Any:

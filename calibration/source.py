@@ -11,9 +11,12 @@ from typing import Any
 from drivers.recordings import Recording
 from drivers.recordings.folder import FolderSet, read_folder
 from drivers.recordings.plate import Plate
+from surfclass.errors import InputError
 from surfclass.frames import Capture
 from surfclass.rig import DepthRig, SurfaceClasses
 
+SERIAL = "serial of "
+"""Keys of a recording's metadata that begin so hold a device's serial number."""
 _CHUNK = 1 << 20
 
 
@@ -33,16 +36,27 @@ class Source:
     plate: Plate | None
     classes: SurfaceClasses | None
     _set: Recording | FolderSet
+    _more: tuple[Source, ...] = ()
 
     @classmethod
-    def open(cls, path: Path) -> Source:
+    def open(cls, path: Path, *more: Path) -> Source:
         """Returns the captures of a recording (a file) or of a data folder.
+
+        Args:
+            path: It gives the rig, the plate and the classes.
+            more: Others of the same package, whose captures come after its own.
 
         Raises:
             InputError, ConfigurationError: Naming the file and what is wrong with it.
         """
         found = read_folder(path) if path.is_dir() else Recording.open(path)
-        return cls(path, found.depth_rig, found.plate, found.classes, found)
+        others = tuple(cls.open(other) for other in more)
+        for other in others:
+            if _images(other.rig) != _images(found.depth_rig):
+                raise InputError(f"{other.path}: its images have not the size of those of {path}")
+        plate = next((one for one in (found.plate, *(other.plate for other in others)) if one), None)
+        classes = next((one for one in (found.classes, *(other.classes for other in others)) if one), None)
+        return cls(path, found.depth_rig, plate, classes, found, others)
 
     def with_values(self, values: Mapping[str, Any]) -> Source:
         """Returns the same captures with some of the rig's keys set anew, nested as in `rig.toml`."""
@@ -50,28 +64,44 @@ class Source:
 
     def captures(self, roles: str | Collection[str]) -> Iterator[Capture]:
         """Yields the captures of these roles in their order, one in memory at a time."""
-        if isinstance(self._set, Recording):
-            yield from self._set.captures(roles)
-            return
         wanted = {roles} if isinstance(roles, str) else set(roles)
-        for capture, _ in self._set.only(wanted).captures():
-            yield capture
+        if isinstance(self._set, Recording):
+            yield from self._set.captures(wanted)
+        else:
+            for capture, _ in self._set.only(wanted).captures():
+                yield capture
+        for other in self._more:
+            yield from other.captures(wanted)
+
+    @property
+    def devices(self) -> dict[str, str]:
+        """Serial numbers of the devices, by what they are, where the recording tells."""
+        if not isinstance(self._set, Recording):
+            return {}
+        found = self._set.metadata.items()
+        return {key.removeprefix(SERIAL): value for key, value in found if key.startswith(SERIAL)}
 
     def count(self, role: str) -> int:
         """Returns how many captures have this role."""
         if isinstance(self._set, FolderSet):
-            return sum(row.role == role for row in self._set.rows)
-        return sum(1 for _ in self._set.captures(role))
+            own = sum(row.role == role for row in self._set.rows)
+        else:
+            own = self._set.roles()[role]
+        return own + sum(other.count(role) for other in self._more)
 
     def digests(self) -> dict[str, str]:
-        """Returns the sha256 of every file that the captures came from, by name."""
-        if not self.path.is_dir():
-            return {self.path.name: _sha256(self.path)}
-        files = sorted(path for path in self.path.rglob("*") if path.is_file())
-        return {str(path.relative_to(self.path)): _sha256(path) for path in files}
+        """Returns the sha256 of every file that the captures came from, by its path."""
+        files = sorted(path for path in self.path.rglob("*") if path.is_file()) if self.path.is_dir() else []
+        found = {str(path): sha256(path) for path in files or [self.path]}
+        return found | {name: digest for other in self._more for name, digest in other.digests().items()}
 
 
-def _sha256(path: Path) -> str:
+def _images(rig: DepthRig) -> tuple[Any, Any]:
+    return rig.depth.size, None if rig.rgb is None else rig.rgb.size
+
+
+def sha256(path: Path) -> str:
+    """Returns the digest of a file, in hex."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while chunk := stream.read(_CHUNK):

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 from daemon import wiring
+from daemon.check_calibration import check_calibration, check_serials
 from daemon.check_devices import check_devices
 from daemon.config import Config
 from daemon.findings import Finding, Notes
@@ -34,12 +35,14 @@ def check(config: Config) -> list[Finding]:
         features = pipeline.rig.features
         note.ok("rig", f"{pipeline.rig.name}, voxels of {pipeline.rig.voxel_size_m * 1000:g} mm")
         note.ok("model", f"{features.colour} and {features.texture}; {names}")
+    check_calibration(config, note)
     _check_zenoh(config, note)
     if config.replay is not None:
         with note.faults_of("recording", "`surfclass recover` mends one that was cut off"):
             note.ok("recording", f"{config.replay}: {len(Recording.open(config.replay))} captures")
     else:
         check_devices(config, pipeline, note)
+        check_serials(config, findings, note)
     return findings
 
 

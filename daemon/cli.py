@@ -11,12 +11,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daemon.cli_calibrate import calibrate, label, verify
+from daemon.cli_options import (
+    EXIT_CONFIGURATION,
+    EXIT_DEVICE,
+    EXIT_GATE_FAILED,
+    EXIT_USAGE,
+    CalibrationOption,
+    ConfigOption,
+    JsonOption,
+    ModelOption,
+    RecordingArgument,
+    SetOption,
+    ThesisOption,
+)
+from daemon.cli_show import show
 from daemon.cli_sim import sim
 
 if TYPE_CHECKING:
     from surfclass.pipeline import PipelineSettings
-
-EXIT_GATE_FAILED, EXIT_USAGE, EXIT_DEVICE, EXIT_CONFIGURATION = 1, 2, 69, 78
 
 app = typer.Typer(
     name="surfclass",
@@ -44,24 +57,11 @@ app = typer.Typer(
     Exit codes: 0 pass, 1 a quality gate failed, 2 usage, 69 device unavailable, 78 configuration.
     """,
 )
-show = typer.Typer(no_args_is_help=True, help="Draw results: a map as picture or PLY, a capture's images.")
+app.add_typer(calibrate, name="calibrate")
+app.command()(label)
+app.command()(verify)
 app.add_typer(show, name="show")
 app.add_typer(sim, name="sim")
-
-RecordingArgument = Annotated[Path, typer.Argument(metavar="REC.mcap", help="A recording.")]
-ModelOption = Annotated[Path, typer.Option("--model", metavar="MODEL", help="What `train` wrote.")]
-ConfigOption = Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The TOML file.")]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="TABLE.KEY=VALUE", help="One-off override; may be repeated."),
-]
-JsonOption = Annotated[
-    str | None, typer.Option("--json", metavar="FILE", help='Write the result as JSON; "-" is stdout.')
-]
-ThesisOption = Annotated[
-    bool,
-    typer.Option("--thesis", help="As in the thesis: every pixel an independent observation, linear pool."),
-]
 
 
 class Update(StrEnum):
@@ -158,11 +158,12 @@ def replay(
     thesis: ThesisOption = False,
     update: UpdateOption = None,
     pool: PoolOption = None,
+    calibration: CalibrationOption = None,
 ) -> None:
     """Run a recording's `map` and `test` captures through the pipeline; the same bytes every time."""
     from daemon import offline
 
-    pipeline, stage_ms = offline.replay(recordings, model, map_, _settings(thesis, update, pool))
+    pipeline, stage_ms = offline.replay(recordings, model, map_, _settings(thesis, update, pool), calibration)
     offline.print_stages(stage_ms)
     offline.console.print(f"{map_}: {len(pipeline.map):,} voxels of {pipeline.map.size_m * 1000:g} mm")
 
@@ -188,6 +189,7 @@ def evaluate(
     thesis: ThesisOption = False,
     update: UpdateOption = None,
     pool: PoolOption = None,
+    calibration: CalibrationOption = None,
 ) -> None:
     """Accuracy against the labels of the `test` captures: voxels, pixels, calibration."""
     from daemon import offline
@@ -204,7 +206,7 @@ def evaluate(
         )
     check_output(json_, png)
     if model is not None:
-        result = offline.evaluate_recording(recording, model, route.value, settings)
+        result = offline.evaluate_recording(recording, model, route.value, settings, calibration)
         offline.print_evaluation(result)
     elif map_ is not None:
         result = offline.evaluate_map(recording, map_)
@@ -222,34 +224,6 @@ def evaluate(
         verdict = "PASS" if reached >= require else "FAIL"
         offline.console.print(f"{verdict}: {gate} {reached:.1%} of the voxels right, {require:.1%} required")
         raise typer.Exit(0 if reached >= require else EXIT_GATE_FAILED)
-
-
-@show.command("map")
-def show_map(
-    map_: Annotated[Path, typer.Argument(metavar="MAP.npz")],
-    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw it.")] = None,
-    ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it as coloured points.")] = None,
-    classes: Annotated[
-        Path | None, typer.Option(metavar="CLASSES.toml", help="Take the colours from here.")
-    ] = None,
-) -> None:
-    """Draw a map as a picture, or write it as PLY."""
-    from daemon import maps
-
-    maps.show(map_, png, ply, classes)
-
-
-@show.command("capture")
-def show_capture(
-    recording: RecordingArgument,
-    png: Annotated[Path, typer.Option(metavar="FILE", help="Where the picture goes.")],
-    name: Annotated[list[str] | None, typer.Option(help="Which captures; default: the first four.")] = None,
-    model: Annotated[Path | None, typer.Option(metavar="MODEL", help="Classify them too.")] = None,
-) -> None:
-    """Draw captures: colour, depth, truth and, with a model, what each route makes of them."""
-    from daemon import maps
-
-    maps.show_captures(recording, png, name or [], model)
 
 
 @app.command()

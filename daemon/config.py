@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
 
+from calibration.gates import Gates
 from surfclass.errors import ConfigurationError
 from surfclass.schema import Number, Positive, Table, validate
 
@@ -195,6 +196,22 @@ class SimSettings(Table):
     faults: tuple[SimFault, ...] = ()
 
 
+class CalibrationSettings(Table):
+    """Commissioning: where its results are, which the service uses on top of `rig`, and their limits.
+
+    Attributes:
+        directory: Of the results; `surfclass calibrate` writes there.
+        plate: The plate of reflector discs, a `plate.toml`; needed for hand-eye captures.
+        board: The checkerboard, a `board.toml`.
+        gates: The limits that a result has to keep.
+    """
+
+    directory: Path
+    plate: Path | None = None
+    board: Path | None = None
+    gates: Gates = Gates()
+
+
 class Config(Table):
     """The whole file.
 
@@ -219,6 +236,7 @@ class Config(Table):
     zenoh: ZenohSettings = ZenohSettings()
     pipeline: PipelineOptions = PipelineOptions()
     limits: Limits = Limits()
+    calibration: CalibrationSettings | None = None
     sim: SimSettings | None = None
     colour: DeviceSettings | None = None
     depth: DeviceSettings | None = None

@@ -355,7 +355,13 @@ class MapClient:
                 snapshot = assembler.take(part) or snapshot
             if snapshot is None or snapshot.epoch in self._ended:
                 return False
-            fresh = VoxelMap(meta.voxel_size_m, meta.classes, meta.update, epoch=snapshot.epoch)
+            fresh = VoxelMap(
+                meta.voxel_size_m,
+                meta.classes,
+                meta.update,
+                epoch=snapshot.epoch,
+                made_with=meta.made_with,
+            )
             fresh.apply(snapshot)
         except (TransportError, TimeoutError, RefusedError, InputError) as error:
             log.info("no map yet: %s", error)

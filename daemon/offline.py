@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 import calibration.train
+from calibration.store import Store
 from drivers.files import check_output, read_file, write_atomically
 from drivers.recordings import Recording, RecordingWriter
 from drivers.recordings.folder import read_folder
@@ -80,6 +82,23 @@ def import_folder(directory: Path, out: Path) -> int:
     return len(folder)
 
 
+def open_recording(path: Path, calibration: Path | None = None) -> Recording:
+    """Returns a recording; its rig is the one that it was made with, unless results are put on top.
+
+    Args:
+        path: The recording.
+        calibration: A directory of results of `calibrate`, or None.
+
+    Raises:
+        InputError, ConfigurationError: If one of them cannot be used.
+    """
+    recording = Recording.open(path)
+    if calibration is None:
+        return recording
+    rig = recording.depth_rig.with_values(Store(calibration).values())
+    return dataclasses.replace(recording, depth_rig=rig)
+
+
 def load_model(path: Path) -> Model:
     """Returns the model in a file.
 
@@ -101,7 +120,11 @@ def train_model(recording_path: Path, out: Path, settings: TrainingSettings) -> 
 
 
 def replay(
-    paths: Sequence[Path], model_path: Path, out: Path, settings: PipelineSettings
+    paths: Sequence[Path],
+    model_path: Path,
+    out: Path,
+    settings: PipelineSettings,
+    calibration: Path | None = None,
 ) -> tuple[Pipeline, dict[str, list[float]]]:
     """Runs the captures of a recording, or of the parts of one, through the pipeline and writes the map.
 
@@ -112,7 +135,7 @@ def replay(
         InputError: If a file is no recording, the parts have different rigs, or nothing is to be mapped.
     """
     check_output(out)
-    parts = [Recording.open(path) for path in paths]
+    parts = [open_recording(path, calibration) for path in paths]
     for path, part in zip(paths, parts, strict=True):
         if (part.rig_text, part.classes_text) != (parts[0].rig_text, parts[0].classes_text):
             raise InputError(f"{path}: has another rig or other classes than {paths[0]}")
@@ -135,14 +158,18 @@ def replay(
 
 
 def evaluate_recording(
-    recording_path: Path, model_path: Path, route: str, settings: PipelineSettings
+    recording_path: Path,
+    model_path: Path,
+    route: str,
+    settings: PipelineSettings,
+    calibration: Path | None = None,
 ) -> dict[str, Any]:
     """Returns the figures of one route, or of all that the model has.
 
     Raises:
         ConfigurationError: If the model does not fit the recording, or has not the route.
     """
-    recording = Recording.open(recording_path)
+    recording = open_recording(recording_path, calibration)
     model = load_model(model_path)
     model.check(recording.rig, recording.classes)
     routes = list(ROUTES) if route == "all" else [route]

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from surfclass.types import Float32, Float64, Int32
+from calibration.plots import draw_confusion, drawing
+from surfclass.types import Float64, Int32
 
 RGB = NDArray[np.uint8]
 _BACKGROUND = (250, 250, 250)
@@ -81,32 +82,32 @@ def draw_map(path: Path, layers: Any, size_m: float, names: tuple[str, ...], cla
         names: The classes.
         class_rgb: (k, 3) their colours.
     """
-    plt = _pyplot()
     label = layers.label()
     confidence = layers.p.max(axis=1)
     class_colour = coloured(label, class_rgb)
-    shades = plt.get_cmap("viridis")(confidence)[:, :3]
     eye = _eye_direction(layers.index, size_m)
     drawn = draw_voxels(layers.index, size_m, class_colour, eye)
-    sure = draw_voxels(layers.index, size_m, (shades * 255).astype(np.uint8), eye)
-    height = 8.5 * drawn.shape[0] / drawn.shape[1] + 1.2
-    figure, axes = plt.subplots(1, 2, figsize=(17, height), layout="constrained")
-    for ax, title, picture in zip(axes, ("surface type", "its probability"), (drawn, sure), strict=True):
-        ax.imshow(picture, interpolation="antialiased")
-        ax.set_title(title)
-        ax.axis("off")
-    counts = np.bincount(label, minlength=len(names) + 1)
-    patches = [
-        plt.matplotlib.patches.Patch(color=rgb / 255, label=f"{name}  {count:,}")
-        for name, rgb, count in zip(names, class_rgb, counts[1:], strict=True)
-    ]
-    if counts[0]:
-        patches.append(plt.matplotlib.patches.Patch(color=_UNKNOWN / 255, label=f"unknown  {counts[0]:,}"))
-    figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), frameon=False)
-    bar = plt.cm.ScalarMappable(cmap="viridis", norm=plt.Normalize(0, 1))
-    figure.colorbar(bar, ax=axes[1], fraction=0.025)
-    figure.suptitle(f"{len(label):,} voxels of {size_m * 1000:g} mm, seen from the robot's side")
-    _save(figure, path)
+    with drawing(path, 1, 2, figsize=(17, 8.5 * drawn.shape[0] / drawn.shape[1] + 1.2)) as (figure, axes):
+        from matplotlib import cm, colormaps, colors, patches  # after `drawing` has chosen how it draws
+
+        shades = colormaps["viridis"](confidence)[:, :3]
+        sure = draw_voxels(layers.index, size_m, (shades * 255).astype(np.uint8), eye)
+        titles = ("surface type", "its probability")
+        for ax, title, picture in zip(axes[0], titles, (drawn, sure), strict=True):
+            ax.imshow(picture, interpolation="antialiased")
+            ax.set_title(title)
+            ax.axis("off")
+        counts = np.bincount(label, minlength=len(names) + 1)
+        legend = [
+            patches.Patch(color=tuple(rgb / 255), label=f"{name}  {count:,}")
+            for name, rgb, count in zip(names, class_rgb, counts[1:], strict=True)
+        ]
+        if counts[0]:
+            legend.append(patches.Patch(color=tuple(_UNKNOWN / 255), label=f"unknown  {counts[0]:,}"))
+        figure.legend(handles=legend, loc="outside lower center", ncols=len(legend), frameon=False)
+        bar = cm.ScalarMappable(cmap="viridis", norm=colors.Normalize(0, 1))
+        figure.colorbar(bar, ax=axes[0][1], fraction=0.025)
+        figure.suptitle(f"{len(label):,} voxels of {size_m * 1000:g} mm, seen from the robot's side")
 
 
 def _eye_direction(index: Int32, size_m: float) -> Float64:
@@ -123,57 +124,22 @@ def coloured(label: NDArray[np.uint8], class_rgb: RGB) -> RGB:
 
 def draw_views(path: Path, rows: list[tuple[str, list[tuple[str, RGB]]]]) -> None:
     """Writes rows of titled pictures: one row a view, the same columns in each."""
-    plt = _pyplot()
     columns = len(rows[0][1])
-    figure, axes = plt.subplots(
-        len(rows), columns, figsize=(3.6 * columns, 2.75 * len(rows)), layout="constrained", squeeze=False
-    )
-    for line, (name, pictures) in zip(axes, rows, strict=True):
-        for ax, (title, picture) in zip(line, pictures, strict=True):
-            ax.imshow(picture)
-            ax.set_title(f"{name}: {title}" if picture is pictures[0][1] else title, fontsize=9)
-            ax.axis("off")
-    _save(figure, path)
+    size = (3.6 * columns, 2.75 * len(rows))
+    with drawing(path, len(rows), columns, figsize=size) as (_, axes):
+        for line, (name, pictures) in zip(axes, rows, strict=True):
+            for ax, (title, picture) in zip(line, pictures, strict=True):
+                ax.imshow(picture)
+                ax.set_title(f"{name}: {title}" if picture is pictures[0][1] else title, fontsize=9)
+                ax.axis("off")
 
 
 def draw_confusions(path: Path, result: dict[str, Any]) -> None:
     """Writes the confusion matrix of every route's fused map, rows normalised to the truth."""
-    plt = _pyplot()
-    routes = result["routes"]
-    figure, axes = plt.subplots(
-        1, len(routes), figsize=(3.4 * len(routes) + 0.6, 3.9), layout="constrained", squeeze=False
-    )
-    names = result["classes"]
-    for ax, (route, figures) in zip(axes[0], routes.items(), strict=True):
-        counts = np.array(figures["fused"]["confusion"], np.float64)
-        share: Float32 | Float64 = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-        ax.imshow(share, cmap="Blues", vmin=0, vmax=1)
-        for row in range(len(names)):
-            for col in range(len(names)):
-                ink = "white" if share[row, col] > 0.55 else "black"
-                ax.text(col, row, f"{share[row, col]:.2f}", ha="center", va="center", color=ink, fontsize=8)
-        ax.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=8)
-        ax.set_yticks(range(len(names)), names, fontsize=8)
-        overall = figures["fused"]["overall"]
-        ax.set_title(f"{route}: {overall:.1%} of {figures['fused']['voxels']:,} voxels", fontsize=9)
-    axes[0][0].set_ylabel("truth")
-    _save(figure, path)
-
-
-def _pyplot() -> Any:
-    import matplotlib  # late: it costs half a second
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
-
-
-def _save(figure: Any, path: Path) -> None:
-    part = path.with_name(f".{path.name}.part")
-    try:
-        figure.savefig(part, format="png", dpi=110)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-        _pyplot().close(figure)
+    routes, names = result["routes"], result["classes"]
+    with drawing(path, 1, len(routes), figsize=(3.4 * len(routes) + 0.6, 3.9)) as (_, axes):
+        for ax, (route, figures) in zip(axes[0], routes.items(), strict=True):
+            draw_confusion(ax, figures["fused"]["confusion"], names)
+            overall = figures["fused"]["overall"]
+            ax.set_title(f"{route}: {overall:.1%} of {figures['fused']['voxels']:,} voxels", fontsize=9)
+        axes[0][0].set_ylabel("truth")

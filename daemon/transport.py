@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import zenoh
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 from zenoh.handlers import Callback
 
 from surfclass.errors import ConfigurationError, InputError
@@ -121,11 +121,17 @@ class MapMeta(Table):
     voxel_size_m: Positive
     classes: SurfaceClasses
     update: Update
+    made_with: dict[str, str] = Field(default_factory=dict)
 
     @classmethod
     def of(cls, voxels: VoxelMap) -> MapMeta:
         """Returns what there is to know of this map."""
-        return cls(voxel_size_m=voxels.size_m, classes=voxels.classes, update=voxels.update)
+        return cls(
+            voxel_size_m=voxels.size_m,
+            classes=voxels.classes,
+            update=voxels.update,
+            made_with=voxels.made_with,
+        )
 
     @classmethod
     def parse(cls, data: bytes | Mapping[str, Any]) -> MapMeta:

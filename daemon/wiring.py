@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zenoh
 
+from calibration.rig_file import rig_text
+from calibration.store import Store
 from daemon import logs
 from daemon.acquisition import Acquisition, Shot
 from daemon.config import RELOADABLE, Config, SimSettings, TriggerSettings
@@ -45,7 +47,7 @@ from surfclass.kinematics import forward_kinematics
 from surfclass.map_file import to_npz_bytes
 from surfclass.model import Model
 from surfclass.pipeline import Pipeline, PipelineSettings
-from surfclass.rig import Rig, parse_rig
+from surfclass.rig import DepthRig, Rig, parse_depth_rig
 from surfclass.wire import encode_update
 
 if TYPE_CHECKING:
@@ -75,8 +77,12 @@ class Sensors:
     world: SimWorld | None
 
 
-def build_sensors(config: Config) -> Sensors:
+def build_sensors(config: Config, with_ir: bool = False) -> Sensors:
     """Returns the configured devices; none is opened yet.
+
+    Args:
+        config: What to build.
+        with_ir: Whether captures keep the IR image.
 
     Raises:
         ConfigurationError: If a backend or an option is unknown, or a needed device is missing.
@@ -95,10 +101,14 @@ def build_sensors(config: Config) -> Sensors:
         devices[kind] = backends.create(
             kind, device.backend, name=kind, clock=clock, options=device.options, shared=shared
         )
-    return Sensors(clock, devices, build_package(config, clock, devices), config.limits.device_s, world)
+    return Sensors(
+        clock, devices, build_package(config, clock, devices, with_ir), config.limits.device_s, world
+    )
 
 
-def build_package(config: Config, clock: Clock, devices: Mapping[str, Any]) -> SensorPackage:
+def build_package(
+    config: Config, clock: Clock, devices: Mapping[str, Any], with_ir: bool = False
+) -> SensorPackage:
     """Returns the sensor package of these devices, which takes captures as configured."""
     seconds = config.limits.device_s
     settings = SensorSettings(
@@ -107,6 +117,7 @@ def build_package(config: Config, clock: Clock, devices: Mapping[str, Any]) -> S
         colour_timeout_s=seconds,
         depth_timeout_s=seconds,
         joints_timeout_s=seconds,
+        with_ir=with_ir,
     )
     light, arm = devices.get("light"), devices.get("arm")
     return SensorPackage(clock, devices["colour"], devices["depth"], light, arm, settings)
@@ -151,18 +162,40 @@ def build_pipeline(config: Config) -> Pipeline:
 
 
 def rig_of(config: Config) -> tuple[str, Rig]:
-    """Returns the text of the rig and the rig: the recording's own where one is replayed.
+    """Returns the text of the rig and the rig, which is whole.
+
+    Raises:
+        InputError, ConfigurationError: As `build_pipeline`.
+    """
+    text, rig = depth_rig_of(config)
+    return text, rig.whole()
+
+
+def depth_rig_of(config: Config) -> tuple[str, DepthRig]:
+    """Returns the rig as far as it is known, and its text: the recording's own where one is replayed.
+
+    Otherwise it is the configured one with the results of commissioning on top.
 
     Raises:
         InputError, ConfigurationError: As `build_pipeline`.
     """
     if config.replay is not None:
         recording = Recording.open(config.replay)
-        return recording.rig_text, recording.rig
+        return recording.rig_text, recording.depth_rig
     if config.rig is None:
         raise ConfigurationError("rig is missing (only a replayed recording brings its own)")
     data = _read(config.rig, "rig")
-    return data.decode(errors="replace"), parse_rig(data, str(config.rig))
+    rig = parse_depth_rig(data, str(config.rig))
+    if config.calibration is None:
+        return data.decode(errors="replace"), rig
+    try:
+        values = Store(config.calibration.directory).values()
+    except InputError as error:
+        raise ConfigurationError(str(error)) from None
+    if not values:
+        return data.decode(errors="replace"), rig
+    rig = rig.with_values(values)
+    return rig_text(rig), rig
 
 
 def _read(path: Path, what: str) -> bytes:

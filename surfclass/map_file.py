@@ -6,7 +6,8 @@ import io
 import tokenize
 import zipfile
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ class MapFile:
         voxel_size_m: Side of a voxel.
         classes: The class names in the order of the layers' columns.
         colours: What each is drawn in, `#rrggbb`; None where the file does not say.
+        made_with: Fingerprints of the rig that it was made with, by part; empty where the file does not say.
         layers: The voxels, sorted by index.
     """
 
@@ -49,6 +51,7 @@ class MapFile:
     classes: tuple[str, ...]
     layers: MapLayers
     colours: tuple[str, ...] | None = None
+    made_with: Mapping[str, str] = field(default_factory=dict)
 
     def at(self, index: Int32) -> MapLayers:
         """Returns the layers of the voxels asked for, (n, 3), in that order; uniform where there is none."""
@@ -76,7 +79,8 @@ def to_npz_bytes(voxels: VoxelMap, pool: Pool = "log-linear") -> bytes:
     """Returns the map as an `.npz` without pickles; the same map gives the same bytes.
 
     Its arrays are `voxel_size_m` (), `classes` and `colours` (k,) text, `index` (n, 3) int32, `p_colour`,
-    `p_texture`, `p` (n, k) float32, `weight` (n,) float32 and `count` (n,) int32.
+    `p_texture`, `p` (n, k) float32, `weight` (n,) float32, `count` (n,) int32, and `made_with` (m, 2) text:
+    parts of the rig and their fingerprints.
 
     Raises:
         ConfigurationError: If there is no such pool.
@@ -86,6 +90,7 @@ def to_npz_bytes(voxels: VoxelMap, pool: Pool = "log-linear") -> bytes:
         "voxel_size_m": np.array(voxels.size_m),
         "classes": np.array(voxels.classes.names),
         "colours": np.array(voxels.classes.colours),
+        "made_with": np.array(sorted(voxels.made_with.items()), np.str_).reshape(-1, 2),
         **{name: getattr(layers, name) for name in _ARRAYS[2:]},
     }
     file = io.BytesIO()
@@ -113,7 +118,7 @@ def from_npz_bytes(data: bytes, source: str) -> MapFile:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise InputError(f"{source}: not a map file (a single array)")
-            arrays = {name: archive[name] for name in (*_ARRAYS, "colours") if name in archive}
+            arrays = {name: archive[name] for name in (*_ARRAYS, "colours", "made_with") if name in archive}
     except InputError:
         raise
     except _DAMAGED as error:
@@ -149,10 +154,16 @@ def from_npz_bytes(data: bytes, source: str) -> MapFile:
         raise InputError(
             f"{source}: colours is {colours.dtype} of shape {colours.shape}, needs str_ of ({k},)"
         )
+    made_with = arrays.get("made_with", np.empty((0, 2), np.str_))
+    if made_with.ndim != 2 or made_with.shape[1] != 2 or not np.issubdtype(made_with.dtype, np.str_):
+        raise InputError(
+            f"{source}: made_with is {made_with.dtype} of shape {made_with.shape}, needs str_ of (m, 2)"
+        )
     layers: dict[str, Float32] = {name: arrays[name] for name in ("p_colour", "p_texture", "p", "weight")}
     return MapFile(
         size_m,
         tuple(str(name) for name in names),
         MapLayers(index=index, count=arrays["count"], **layers),
         None if colours is None else tuple(str(colour) for colour in colours),
+        {str(part): str(digest) for part, digest in made_with},
     )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from surfclass import quality
 from surfclass.errors import InputError
+from surfclass.fingerprint import fingerprints
 from surfclass.frames import Capture
 from surfclass.kinematics import depth_pose
 from surfclass.model import Model
@@ -104,7 +105,12 @@ class Pipeline:
 
     def new_map(self) -> VoxelMap:
         """Returns an empty map of this pipeline's voxel size, classes and update rule."""
-        return VoxelMap(self.rig.voxel_size_m, self.model.classes, self.settings.update)
+        return VoxelMap(
+            self.rig.voxel_size_m,
+            self.model.classes,
+            self.settings.update,
+            made_with=fingerprints(self.rig),
+        )
 
     def process(self, capture: Capture) -> FrameResult:
         """Adds one capture to the map.

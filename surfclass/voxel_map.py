@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import get_args
 
@@ -64,19 +65,27 @@ class VoxelMap:
         classes: The surface classes, in the order of the observations' columns.
         update: As above.
         epoch: Id of this life of the map, 32 hex digits; random if not given.
+        made_with: Fingerprints of the rig (`surfclass.fingerprint`), by which a stale map is known.
 
     Raises:
         ConfigurationError: If the size or the kind of update cannot be.
     """
 
     def __init__(
-        self, size_m: float, classes: SurfaceClasses, update: Update = "frame", *, epoch: str | None = None
+        self,
+        size_m: float,
+        classes: SurfaceClasses,
+        update: Update = "frame",
+        *,
+        epoch: str | None = None,
+        made_with: Mapping[str, str] | None = None,
     ) -> None:
         if update not in get_args(Update):
             raise ConfigurationError(f"update: {update!r}, known are {', '.join(get_args(Update))}")
         self.size_m = check_size(size_m)
         self.classes = classes
         self.update: Update = update
+        self.made_with = dict(made_with or {})
         self._lock = threading.RLock()
         self._start(uuid.uuid4().hex if epoch is None else epoch)
 

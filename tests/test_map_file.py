@@ -37,6 +37,7 @@ def test_the_file_has_the_arrays_that_are_promised_and_no_others() -> None:
         "p": ("f", (n, K)),
         "weight": ("f", (n,)),
         "count": ("i", (n,)),
+        "made_with": ("U", (0, 2)),
     }
     assert arrays["index"].dtype == np.int32
     assert arrays["p"].dtype == arrays["p_colour"].dtype == arrays["p_texture"].dtype == np.float32
@@ -54,6 +55,19 @@ def test_a_map_without_colours_is_read_too_and_wrong_ones_are_refused() -> None:
     assert from_npz_bytes(without.getvalue(), "map").colours is None
     np.savez(wrong, **{**arrays, "colours": arrays["colours"][:-1]})
     with pytest.raises(InputError, match="colours"):
+        from_npz_bytes(wrong.getvalue(), "map")
+
+
+def test_a_map_says_what_it_was_made_with_and_one_that_does_not_is_read_too() -> None:
+    voxels = VoxelMap(SIZE_M, CLASSES, made_with={"light": "ab12", "cameras": "cd34"})
+    assert from_npz_bytes(to_npz_bytes(voxels), "map").made_with == {"cameras": "cd34", "light": "ab12"}
+    with np.load(io.BytesIO(to_npz_bytes(voxels)), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    without, wrong = io.BytesIO(), io.BytesIO()
+    np.savez(without, **{name: array for name, array in arrays.items() if name != "made_with"})
+    assert from_npz_bytes(without.getvalue(), "map").made_with == {}
+    np.savez(wrong, **{**arrays, "made_with": arrays["made_with"][:, :1]})
+    with pytest.raises(InputError, match="made_with"):
         from_npz_bytes(wrong.getvalue(), "map")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,6 +147,14 @@ class Recording:
         for unknown in set(roles) - set(ROLES):
             raise InputError(f"{self.path}: role {unknown!r}, allowed: {', '.join(ROLES)}")
         return self._captures(roles)
+
+    def roles(self) -> Counter[str]:
+        """Returns how many captures of each role there are; no image is decoded.
+
+        Raises:
+            InputError: Where the file turns out to be damaged.
+        """
+        return Counter(parse_record(entry.data, str(self.path)).role for entry in self._entries((CAPTURE,)))
 
     def updates(self) -> Iterator[bytes]:
         """Yields the encoded map updates in the order in which they were written.
