@@ -44,8 +44,6 @@ def refine(grey: Float32, rough: Float64, size: tuple[int, int]) -> Float64:
     for blur in reversed([blur for blur in _BLURS_PX if blur <= widest]):
         corners, misfit = _fit(grey, corners, along, down, blur, noise)  # the widest reaches farthest
         fits.append((misfit, corners))
-        if len(fits) > 1 and fits[-1][0] > fits[-2][0]:
-            break  # narrower ones fit worse and worse
     best = min(fits, key=lambda fit: fit[0])[1]
     away = np.linalg.norm(best - start, axis=1)
     return np.where((away < _MOST_SHIFT * side)[:, None], best, np.nan)

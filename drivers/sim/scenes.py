@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.sim.materials import CLASS_NAMES
 from drivers.sim.shapes import box, upright, wall
-from drivers.sim.surfaces import Surface, bands, checker, discs
+from drivers.sim.surfaces import TEXEL_M, Surface, bands, checker, discs
 from drivers.sim.views import Look, Viewpoint, reach
 from surfclass.errors import ConfigurationError
 
@@ -103,31 +103,32 @@ def _limits(material: str) -> Scene:
 
 
 def _checkerboard() -> Scene:
-    x, z = 1.46, 0.65
-    centre, aim = (x, 0.0, z), (x, 0.0, z + 0.04)  # the depth camera, whose IR sees it too, looks lower
-    board = upright("checkerboard", centre, (0.30, 0.225), ("white", "black"), checker(0.025, 10, 7))
-    tilts = (
-        (0, 0),
-        (25, 0),
-        (-25, 0),
-        (0, 25),
-        (0, -25),
-        (20, 18),
-        (-20, 18),
-        (20, -18),
-        (-20, -18),
-        (38, 0),
+    x, side = 1.46, 0.025
+    # 72 texels a square: its edges then lie on texels' borders, and the board is as true as it says.
+    board = upright(
+        "checkerboard",
+        (x, 0.0, 0.65),
+        (0.30, 0.225),
+        ("white", "black"),
+        checker(side, 10, 7),
+        coarseness=side / (72 * TEXEL_M),
     )
-    looks = [
-        Look(f"tilt_{index:02d}", aim, 0.62 + 0.03 * index, turn, rise, 6.0 * (index % 3 - 1))
-        for index, (turn, rise) in enumerate(tilts)
-    ]
-    places = ((0.12, 0.09), (-0.12, 0.09), (-0.12, -0.09), (0.12, -0.09))
-    looks += [
-        Look(f"corner_{index}", (x, y, z + up), 0.72, 10.0 * (-1) ** index, 8.0)
-        for index, (y, up) in enumerate(places)
-    ]
-    return Scene("checkerboard", (*box(board, 0.004, ("white",)), wall()), tuple(looks))
+    # Chosen for what they tell of both cameras and of where they are to each other: near and tilted, all
+    # round the image and turned about the line of sight; a few fill the depth camera's image alone.
+    places = (
+        (-0.05, 0.65, 0.50, 22, -17, 0), (-0.01, 0.64, 0.40, 1, -33, 0), (0.12, 0.86, 0.80, 18, -17, -90),
+        (0.07, 0.51, 0.45, -18, 17, 180), (-0.18, 0.52, 0.80, 11, -16, 0), (0.02, 0.81, 0.60, 4, 7, 90),
+        (0.05, 0.69, 0.50, -21, -6, 0), (-0.02, 0.72, 0.50, -21, 0, 90), (0.02, 0.79, 0.50, 6, 19, -90),
+        (-0.04, 0.81, 0.45, 5, -33, 0), (0.05, 0.60, 0.45, 3, -14, 180), (-0.07, 0.72, 0.50, -1, 10, 0),
+        (0.20, 0.49, 0.90, -2, -6, 0), (0.20, 0.85, 0.90, 7, 7, 0), (0.19, 0.79, 0.90, -19, 9, 180),
+        (-0.18, 0.82, 0.90, 27, -20, 0), (-0.11, 0.83, 0.70, -34, -16, 90), (-0.01, 0.48, 0.55, 3, -18, -90),
+        (-0.12, 0.42, 0.90, -13, 31, 90), (0.04, 0.79, 0.38, -12, -1, 0),
+    )  # fmt: skip
+    looks = tuple(
+        Look(f"view_{index:02d}", (x, y, z), distance, turn, rise, roll)
+        for index, (y, z, distance, turn, rise, roll) in enumerate(places)
+    )
+    return Scene("checkerboard", (*box(board, 0.004, ("white",)), wall()), looks)
 
 
 def _reflector_discs() -> Scene:
