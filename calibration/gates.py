@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from surfclass.schema import Positive, Table
+from surfclass.schema import Number, Positive, Table
 
 
 class CamerasGates(Table):
@@ -62,9 +62,36 @@ class ResponseGates(Table):
 
 
 class LimitsGates(Table):
-    """Of `calibrate limits`."""
+    """Of `calibrate limits`.
 
-    captures: Positive = 4
+    Attributes:
+        captures: The fewest labelled captures.
+        distance_ratio: The least that the farthest windows are away, over the nearest.
+        angle_span_rad: The least between the most direct and the most oblique windows.
+        gain: The least that a window of another capture is more likely under the new limits than under
+            those in use, nats; a standard error below it still passes.
+        classes: The least share of classes that have limits of their own.
+    """
+
+    captures: Positive = 6
+    distance_ratio: Positive = 1.3
+    angle_span_rad: Positive = 0.35
+    gain: Number = 0.0
+    classes: Annotated[Positive, Field(le=1)] = 0.5
+
+
+class TrainGates(Table):
+    """Of `train`: on places that the model was not trained on, of the colour feature in use and of texture.
+
+    Attributes:
+        colour_accuracy: The least share of samples that are right, mean over the classes.
+        texture_accuracy: Likewise, of windows.
+        ece: The greatest expected calibration error.
+    """
+
+    colour_accuracy: Annotated[Positive, Field(le=1)] = 0.6
+    texture_accuracy: Annotated[Positive, Field(le=1)] = 0.5
+    ece: Annotated[Positive, Field(le=1)] = 0.1
 
 
 class VerifyGates(Table):
@@ -101,4 +128,5 @@ class Gates(Table):
     light: LightGates = LightGates()
     response: ResponseGates = ResponseGates()
     limits: LimitsGates = LimitsGates()
+    train: TrainGates = TrainGates()
     verify: VerifyGates = VerifyGates()

@@ -44,9 +44,9 @@ def search(
 ) -> tuple[Trial, list[Trial]]:
     """Returns the smoothest machine that is as good as the best, and every trial.
 
-    "As good" is a likelihood on held-out places within one standard error of the paired difference to
-    the best (Breiman et al. 1984): what the places cannot tell apart is settled by smoothness, for
-    other distances and lights are farther away than other places are.
+    "As good" is a likelihood on held-out places within one standard error of the best one's (the
+    one-standard-error rule of Breiman et al., 1984): what the places cannot tell apart is settled by
+    smoothness, for other distances and lights are farther away than other places are.
 
     Args:
         x: (n, d) features.
@@ -62,19 +62,16 @@ def search(
         InputError: As `svm.cross_fit`.
     """
     pairs = list(product(sorted(gamma)[:1] if kernel == "linear" else sorted(gamma), sorted(C)))
-    trials, of_place = [], []
+    trials = []
     for one_gamma, one_C in pairs:
         found = svm.cross_fit(
             x, label, groups, kernel=kernel, C=one_C, gamma=one_gamma, folds=folds, seed=seed
         )
         loss = place_losses(found.posterior, label[found.rows], groups[found.rows])
-        of_place.append(loss)
         trials.append(Trial(one_C, one_gamma, float(loss.mean()), _standard_error(loss)))
-    best = int(np.argmin([trial.nll for trial in trials]))
-    for trial, loss in zip(trials, of_place, strict=True):  # the smoothest first
-        if trial.nll - trials[best].nll <= _standard_error(loss - of_place[best]):
-            return trial, trials
-    return trials[best], trials
+    best = min(trials, key=lambda trial: trial.nll)
+    allowed = best.nll + best.sd
+    return next(trial for trial in trials if trial.nll <= allowed), trials  # the smoothest is tried first
 
 
 def place_losses(posterior: Float64, label: Index, groups: Index) -> Float64:

@@ -1,0 +1,1 @@
+"""`train`: labelled captures become a model, with a card that says how good it is and where it holds."""
