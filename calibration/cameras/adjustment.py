@@ -45,6 +45,7 @@ class Adjustment:
         covariance: (s, s) formal, of what all views share: the free parameters of the first camera, of
             the second, …, then six numbers (rotation vector, translation) of each further camera.
         information: (views, s, s) what each view adds to its inverse.
+        pull: (views, s) where each view would move that; together they are in balance.
     """
 
     state: State
@@ -53,6 +54,7 @@ class Adjustment:
     noise_px: Float64
     covariance: Float64
     information: Float64
+    pull: Float64
 
     def shared(self) -> Float64:
         """Returns (s,) what all views share, as in `covariance`; the six numbers are 0."""
@@ -80,9 +82,15 @@ def adjust(
         if noise_px is None:
             noise = corner_noise(observations, residuals(observations, state))
     equations = _Equations.of(observations, state, free, noise)
-    information = equations.reduced_by_view()
+    information, pull = equations.reduced_by_view()
     covariance = np.linalg.pinv(information.sum(axis=0), hermitian=True)
-    return Adjustment(state, free, equations.residual, noise, covariance, information)
+    return Adjustment(state, free, equations.residual, noise, covariance, information, pull)
+
+
+def resected(observations: Observations, start: State, noise_px: Float64) -> State:
+    """Returns the state with each view's pose adjusted to its corners; the cameras stay as they are."""
+    free = np.zeros((len(start.parameters), _P), bool)
+    return _minimum(observations, start, free, np.asarray(noise_px, np.float64), only_poses=True)
 
 
 def residuals(observations: Observations, state: State) -> Float64:
@@ -117,11 +125,13 @@ def _in_camera(observations: Observations, state: State, points: Float64) -> Flo
     return np.asarray(np.einsum("nij,nj->ni", place[:, :3, :3], points) + place[:, :3, 3])
 
 
-def _minimum(observations: Observations, start: State, free: Bool, noise: Float64) -> State:
+def _minimum(
+    observations: Observations, start: State, free: Bool, noise: Float64, only_poses: bool = False
+) -> State:
     state, damping = start, 1e-4
     equations = _Equations.of(observations, state, free, noise)
     for _ in range(_MOST_STEPS):
-        candidate = _stepped(state, free, *equations.solved(damping))
+        candidate = _stepped(state, free, *equations.solved(damping, only_poses))
         cost = _cost(observations, candidate, noise)
         if not cost < equations.cost:
             damping *= 8
@@ -209,7 +219,7 @@ class _Equations:
         ends = np.searchsorted(observations.view, np.arange(len(state.poses) + 1))
         blocks = [slice(ends[i], ends[i + 1]) for i in range(len(state.poses))]
         width = s.shape[2]
-        rows = [(s[b].reshape(-1, width), v[b].reshape(-1, 6), r[b].reshape(-1)) for b in blocks]
+        rows = [(s[b].reshape(r[b].size, width), v[b].reshape(-1, 6), r[b].reshape(-1)) for b in blocks]
         return cls(
             residual,
             float(_huber(away).sum()),
@@ -220,19 +230,23 @@ class _Equations:
             np.array([b.T @ c for _, b, c in rows]),
         )
 
-    def reduced_by_view(self) -> Float64:
-        """(views, s, s) what each view says of what is shared, its pose eliminated."""
-        inverse = np.linalg.inv(_damped(self.pose, 1e-12))
-        return np.asarray(self.shared - self.mixed @ inverse @ np.swapaxes(self.mixed, 1, 2))
+    def reduced_by_view(self) -> tuple[Float64, Float64]:
+        """What each view says of what is shared, its pose eliminated: (views, s, s) and (views, s)."""
+        gain = self.mixed @ np.linalg.inv(_damped(self.pose, 1e-12))
+        matrix = self.shared - gain @ np.swapaxes(self.mixed, 1, 2)
+        return matrix, self.shared_right - np.einsum("vsk,vk->vs", gain, self.pose_right)
 
-    def solved(self, damping: float) -> tuple[Float64, Float64]:
+    def solved(self, damping: float, only_poses: bool) -> tuple[Float64, Float64]:
         """Returns the step of what is shared (s,) and of the poses (views, 6)."""
         inverse = np.linalg.inv(_damped(self.pose, max(damping, 1e-12)))
+        if only_poses:
+            still = np.zeros(self.shared_right.shape[1])
+            return still, np.einsum("vij,vj->vi", inverse, self.pose_right)
         gain = self.mixed @ inverse
         whole = _damped(self.shared.sum(axis=0), damping)
         matrix = whole - (gain @ np.swapaxes(self.mixed, 1, 2)).sum(axis=0)
         right = self.shared_right.sum(axis=0) - np.einsum("vsk,vk->s", gain, self.pose_right)
-        shared = np.linalg.lstsq(matrix, right, rcond=None)[0] if len(right) else right
+        shared = np.linalg.lstsq(matrix, right, rcond=None)[0]
         poses = np.einsum("vij,vj->vi", inverse, self.pose_right - np.einsum("vsk,s->vk", self.mixed, shared))
         return shared, poses
 
