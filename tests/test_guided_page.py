@@ -199,8 +199,8 @@ setTimeout(() => {
   console.log(JSON.stringify({step: text("step"), count: text("count"), title: text("title"),
     notice: text("notice"), bar: made.done.style.width, picture: made.picture.src ?? null,
     judged: made.judged.children.map((one) => [one.textContent, one.className]),
-    coverage: made.coverage.children.map((one) => [one.kind, one.textContent, one.value ?? null,
-      one.cells?.length ?? 0]), disabled: made.capture.disabled, posted}));
+    coverage: made.coverage.children.map((one) => one.children.map((part) => [part.kind, part.textContent,
+      part.value ?? null, part.cells?.length ?? 0])), last: [text("last"), made.last.className], disabled: made.capture.disabled, posted}));
   process.exit(0);
 }, 100);
 """
@@ -222,9 +222,10 @@ def test_the_script_puts_everything_where_it_belongs(page, tmp_path):
     assert seen["bar"].startswith("7.14")
     assert seen["picture"] == f"/picture.jpg?version={told['picture']}"
     assert seen["judged"] == [["2 refused: it is <cut off>", "refused"], ["1 taken board_0001", "accepted"]]
-    heads = [["h2", "image", None, 0], ["h2", "tilt 25 %", None, 0]]
-    assert seen["coverage"][::2] == heads
-    assert seen["coverage"][1::2] == [["canvas", "", None, 4], ["meter", "", 0.25, 0]]
+    image, tilt = seen["coverage"]
+    assert image == [["h2", "image", None, 0], ["canvas", "", None, 4]]
+    assert tilt == [["h2", "tilt 25 %", None, 0], ["meter", "", 0.25, 0]]
+    assert seen["last"] == ["2 refused: it is <cut off>", "refused"]
     assert seen["disabled"]
     assert [command for command, _ in seen["posted"]] == ["capture", "abort"]
     assert {token for _, token in seen["posted"]} == {token_of(page)}

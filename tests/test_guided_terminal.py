@@ -58,12 +58,16 @@ def test_a_log_gets_a_line_for_each_thing_and_none_twice(printed):
         "hand-eye",
         "  1 taken hand_eye_0001 (1/14)",
         "  still thin: rolled 50%",
-        "  image |  ██|",
-        "        |░░  |",
         "  next: roll it [30°]",
         "  2 refused: it is cut off; go back",
         "  thin at the left",
     ]
+
+
+def test_what_of_the_image_is_covered_is_drawn_at_the_end(printed):
+    with ui(printed) as terminal:
+        terminal.show(situation(doing="ended", next_step=""))
+    assert printed.getvalue().splitlines()[-2:] == ["  image |  ██|", "        |░░  |"]
 
 
 def test_a_whole_capture_can_be_followed_in_a_log(printed, tmp_path):
@@ -72,7 +76,9 @@ def test_a_whole_capture_can_be_followed_in_a_log(printed, tmp_path):
     text = printed.getvalue()
     for line in ("next: show view 1", "1 taken board_0001 (1/3)", "2 refused: view 2 shows nothing"):
         assert line in text
-    assert text.rstrip().splitlines()[-3].endswith("taken board_0003 (3/3)")
+    assert text.rstrip().splitlines()[-3:] == [
+        "  4 taken board_0003 (3/3)", "  all is covered", "  image |██  |",
+    ]  # fmt: skip
 
 
 def test_a_terminal_is_told_how_to_answer_and_a_log_is_not(printed, typed):

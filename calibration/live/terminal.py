@@ -40,7 +40,6 @@ class TerminalUi:
         self._printed = 0
         self._step = self._notice = ""
         self._title: str | None = None
-        self._coverage: Mapping[str, Any] = {}
         self._rest = ""  # of a line whose end has not been typed yet
         self._status: Status | None = None
 
@@ -69,7 +68,9 @@ class TerminalUi:
         for one in fresh:
             self._line(_judged(one, situation))
         if any(one.verdict == "accepted" for one in fresh):
-            self._show_coverage(situation.coverage)
+            self._show_shares(situation.coverage)
+        if situation.doing in ("done", "ended"):
+            self._show_grids(situation.coverage)
         if situation.next_step and situation.next_step != self._step:
             self._line(f"  next: [bold]{escape(situation.next_step)}[/bold]")
         if situation.notice and situation.notice != self._notice:
@@ -97,11 +98,13 @@ class TerminalUi:
             self._line(f"  {_HELP}")
         return said
 
-    def _show_coverage(self, coverage: Mapping[str, Any]) -> None:
+    def _show_shares(self, coverage: Mapping[str, Any]) -> None:
         shares = {name: value for name, value in coverage.items() if isinstance(value, int | float)}
         lacking = thin(shares)
         if shares:
             self._line(f"  still thin: {escape('; '.join(lacking))}" if lacking else "  all is covered")
+
+    def _show_grids(self, coverage: Mapping[str, Any]) -> None:
         for name, value in coverage.items():
             if not isinstance(value, int | float):
                 for number, row in enumerate(shaded(value)):
