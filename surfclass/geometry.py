@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surfclass.errors import ConfigurationError, InputError
-from surfclass.rig import Camera, Rig
+from surfclass.rig import Camera, DepthCorrection, DepthRig, Rig
 from surfclass.types import Bool, Float32, Float64, Transform, freeze
 
 JUMP = 0.03
@@ -117,6 +117,46 @@ def depth_to_points(depth_mm: NDArray[Any], camera: Camera) -> Float32:
     return points
 
 
+def corrected_depth(depth_mm: NDArray[Any], rig: DepthRig) -> NDArray[Any]:
+    """Returns the depth image as the rig's `depth_correction` has it: the image itself where there is none.
+
+    Args:
+        depth_mm: (h, w) as the sensor reads it, along the optical axis, 0 = no return.
+        rig: Its depth camera and the correction.
+
+    Returns:
+        (h, w) mm; float32 where it is corrected; 0 = no return, or a reading beyond the infinite.
+
+    Raises:
+        InputError: If the image has not the camera's size.
+    """
+    check_size(depth_mm, rig.depth)
+    correction = rig.depth_correction
+    if correction is None:
+        return depth_mm
+    multiplier = _multiplier(correction, rig.depth.shape)
+    depth: Float32 = np.multiply(depth_mm, multiplier, dtype=np.float32, casting="same_kind")
+    if correction.inverse_offset_per_m:
+        offset = np.float32(1e-3 * correction.inverse_offset_per_m)  # 1 / (1/z + c) = z / (1 + c z)
+        stretch = 1 + offset * depth
+        depth = np.divide(depth, stretch, out=np.zeros_like(depth), where=stretch > 0)
+    return depth
+
+
+def multiplier_terms(x: NDArray[Any], y: NDArray[Any], count: int) -> Float64:
+    """Returns (count, …) the terms of `DepthCorrection.multiplier` at places of -1…1 in the image."""
+    order = {1: 0, 3: 1, 6: 2, 10: 3}[count]
+    return np.stack([x ** (degree - j) * y**j for degree in range(order + 1) for j in range(degree + 1)])
+
+
+@lru_cache(maxsize=4)
+def _multiplier(correction: DepthCorrection, shape: tuple[int, int]) -> Float32:
+    y, x = (np.linspace(-1, 1, side) for side in shape)
+    place = np.meshgrid(x, y)
+    terms = multiplier_terms(*place, len(correction.multiplier))
+    return _frozen(np.tensordot(np.array(correction.multiplier), terms, axes=1))
+
+
 def check_size(depth_mm: NDArray[Any], camera: Camera) -> None:
     """Raises InputError where a depth image has not its camera's size."""
     if depth_mm.shape != camera.shape:
@@ -169,13 +209,13 @@ def register(depth_mm: NDArray[Any], rig: Rig) -> RegisteredDepth:
     surface hides from the colour camera.
 
     Args:
-        depth_mm: (h, w) along the optical axis of the depth camera, 0 = no return.
-        rig: Its cameras and `rgb_T_depth` (the thesis' text says the inverse, against its notation).
+        depth_mm: (h, w) as the sensor reads it, along its optical axis, 0 = no return.
+        rig: Its cameras, `depth_correction` and `rgb_T_depth` (the thesis' text says the inverse, against its notation).
 
     Raises:
         InputError: If the image has not the depth camera's size.
     """
-    check_size(depth_mm, rig.depth)
+    depth_mm = corrected_depth(depth_mm, rig)
     pair = _pair(rig.rgb, rig.depth, rig.transforms.rgb_T_depth)
     inverse, x, y = _in_rgb(depth_mm, pair)
     nearest, hidden = _nearest_surface(inverse, x, y, rig.rgb, pair.cell_px)

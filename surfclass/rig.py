@@ -151,6 +151,31 @@ class Lens(Table):
     circle_of_confusion_m: Positive
 
 
+class DepthCorrection(Table):
+    """What the depth sensor's readings have to be corrected by (see `geometry.corrected_depth`).
+
+    With x and y the place in the depth image, from -1 at its first column and row to 1 at its last, the
+    true depth is 1 / (1 / (m(x, y) z) + inverse_offset_per_m).
+
+    Attributes:
+        multiplier: Coefficients of m by rising order, x before y: 1; x, y; x², xy, y²; x³, x²y, xy², y³.
+            Their number, 1, 3, 6 or 10, says the order.
+        inverse_offset_per_m: What a wrong zero of the disparity adds to the inverse depth.
+    """
+
+    multiplier: Annotated[tuple[Number, ...], Field(min_length=1)] = (1.0,)
+    inverse_offset_per_m: Number = 0.0
+
+    @field_validator("multiplier")
+    @classmethod
+    def _order_is_whole(cls, coefficients: tuple[float, ...]) -> tuple[float, ...]:
+        if len(coefficients) not in (1, 3, 6, 10):
+            raise ValueError(f"{len(coefficients)} coefficients, allowed are 1, 3, 6 or 10")
+        if not 0.5 < coefficients[0] < 2:
+            raise ValueError("the first coefficient is a scale, allowed is 0.5 to 2")
+        return coefficients
+
+
 class Arm(Table):
     """What differs between mounted VM-6083 arms.
 
@@ -182,6 +207,7 @@ class DepthRig(Table):
     class_texture_limits: dict[str, TextureLimits] = Field(default_factory=dict)
     lens: Lens | None = None
     arm: Arm = Arm()
+    depth_correction: DepthCorrection | None = None
 
     @field_validator("schema_version")
     @classmethod

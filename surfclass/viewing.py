@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from surfclass.geometry import RegisteredDepth, register
+from surfclass.geometry import RegisteredDepth, corrected_depth, register
 from surfclass.normals import DEFAULT_SETTINGS, Normals, NormalSettings, estimate_normals
 from surfclass.rig import Rig
 from surfclass.types import Bool, Float32, Float64, SurfaceView
@@ -25,15 +25,15 @@ def view_surface(
     those of Eq. 4.13 and 4.14; the light's are None where the rig has no light.
 
     Args:
-        depth_mm: (h, w) along the optical axis of the depth camera, 0 = no return.
-        rig: Cameras, `rgb_T_depth` and light.
+        depth_mm: (h, w) as the sensor reads it, along its optical axis, 0 = no return.
+        rig: Cameras, `rgb_T_depth`, `depth_correction` and light.
         settings: How normals are fitted.
 
     Raises:
         InputError: If the image has not the depth camera's size.
     """
     registered = register(depth_mm, rig)
-    normals = estimate_normals(depth_mm, rig.depth, settings)
+    normals = estimate_normals(corrected_depth(depth_mm, rig), rig.depth, settings)
     normal, has_normal = _normals_at(registered, normals, rig.rgb_T_depth.rotation)
     origin = np.zeros(3)
     distance, cosine = _seen_from(origin, registered.point, normal, registered.has_point)

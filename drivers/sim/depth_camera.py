@@ -112,6 +112,7 @@ def measure(
     smooth = cv2.GaussianBlur(draw, (0, 0), _CORRELATION_PX)
     # A Gaussian of this sigma leaves 1 / (2 sigma √π) of the standard deviation.
     error = smooth * np.float32(DISPARITY_SD_PX * 2 * _CORRELATION_PX * np.sqrt(np.pi))
+    true = _misread(package, true)
     disparity = np.round((true + error) / DISPARITY_STEP_PX) * np.float32(DISPARITY_STEP_PX)
     with np.errstate(divide="ignore"):
         depth = np.where(disparity > 0, per_metre / disparity, np.float32(0))
@@ -122,6 +123,18 @@ def measure(
     counts = cv2.GaussianBlur(light, (0, 0), 0.6) + np.float32(6)
     counts += np.sqrt(counts + 9) * noise.standard_normal(shape, dtype=np.float32)
     return depth_mm, np.clip(np.round(counts), 0, IR_FULL_SCALE).astype(np.uint16)
+
+
+def _misread(package: Package, disparity: Float32) -> Float32:
+    """The disparity that a sensor finds whose own calibration is off; an ideal one finds the true one."""
+    scale = package.depth_scale
+    if scale == (1.0, 0.0, 0.0, 0.0, 0.0, 0.0) and package.disparity_offset_px == 0:
+        return disparity
+    height, width = disparity.shape
+    x = np.linspace(-1, 1, width)[None, :]
+    y = np.linspace(-1, 1, height)[:, None]
+    read = scale[0] + scale[1] * x + scale[2] * y + scale[3] * x * x + scale[4] * x * y + scale[5] * y * y
+    return np.asarray(disparity / read + package.disparity_offset_px, np.float32)
 
 
 def _jitter(z: Float32, noise: np.random.Generator) -> Float32:

@@ -92,6 +92,9 @@ class Package:
         nominal_exposure_s: What `Led.gain_m2` refers to.
         flange_offset_m: The last D-H length.
         projector_baseline_m: The depth camera's projector lies here along its x axis.
+        depth_scale: What the depth camera reads, divided by the true depth: coefficients of 1, x, y, x²,
+            xy, y² with x and y the place in its image from -1 at the first column and row to 1 at the last.
+        disparity_offset_px: What it adds to its disparity.
     """
 
     rgb: Camera
@@ -108,6 +111,8 @@ class Package:
     nominal_exposure_s: float = 0.010
     flange_offset_m: float = 0.084
     projector_baseline_m: float = 0.075
+    depth_scale: tuple[float, float, float, float, float, float] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    disparity_offset_px: float = 0.0
 
     @cached_property
     def flange_T_rgb(self) -> Transform:
