@@ -210,7 +210,8 @@ def register(depth_mm: NDArray[Any], rig: Rig) -> RegisteredDepth:
 
     Args:
         depth_mm: (h, w) as the sensor reads it, along its optical axis, 0 = no return.
-        rig: Its cameras, `depth_correction` and `rgb_T_depth` (the thesis' text says the inverse, against its notation).
+        rig: Its cameras, `depth_correction`, and `rgb_T_depth` (the thesis' text says the inverse, against
+            its notation).
 
     Raises:
         InputError: If the image has not the depth camera's size.

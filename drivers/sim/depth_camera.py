@@ -17,7 +17,7 @@ from drivers.sim.randomness import stream
 from drivers.sim.raycast import Hits, crop_of, length, lit_share
 from drivers.sim.reflection import footprint, points_of
 from drivers.sim.surfaces import Texture
-from surfclass.types import Float32
+from surfclass.types import Float32, Float64
 
 DISPARITY_SD_PX = 0.10
 DISPARITY_STEP_PX = 1 / 8
@@ -125,7 +125,7 @@ def measure(
     return depth_mm, np.clip(np.round(counts), 0, IR_FULL_SCALE).astype(np.uint16)
 
 
-def _misread(package: Package, disparity: Float32) -> Float32:
+def _misread(package: Package, disparity: Float64) -> Float64:
     """The disparity that a sensor finds whose own calibration is off; an ideal one finds the true one."""
     scale = package.depth_scale
     if scale == (1.0, 0.0, 0.0, 0.0, 0.0, 0.0) and package.disparity_offset_px == 0:
@@ -134,7 +134,7 @@ def _misread(package: Package, disparity: Float32) -> Float32:
     x = np.linspace(-1, 1, width)[None, :]
     y = np.linspace(-1, 1, height)[:, None]
     read = scale[0] + scale[1] * x + scale[2] * y + scale[3] * x * x + scale[4] * x * y + scale[5] * y * y
-    return np.asarray(disparity / read + package.disparity_offset_px, np.float32)
+    return np.asarray(disparity / read + package.disparity_offset_px)
 
 
 def _jitter(z: Float32, noise: np.random.Generator) -> Float32:
