@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.hand_eye.discs_image import ROUND, Blob, find_blobs, saturation_level
+from calibration.hand_eye.discs_image import ROUND, Blob, best_of, find_blobs, saturation_level
 from calibration.hand_eye.discs_outline import Circle, circle_points, fit_outline, tangents_at
 from calibration.hand_eye.discs_plane import InversePlane, Readings, plane_of_disc
 from calibration.hand_eye.discs_seen import Disc, Rejected, Sighting
@@ -66,15 +66,26 @@ def look_for_discs(frame: DepthFrame, camera: Camera, radius_m: float) -> Sighti
     for blob in sorted(blobs, key=lambda blob: -brightness[id(blob)]):
         if found and brightness[id(blob)] < _FAINT * faintest:
             break  # nobody takes for a disc what is far darker than all of them
-        answer = look.at(blob, blobs)
-        if isinstance(answer, str):
-            rejected.append(Rejected(blob.pixel, answer, blob.outline))
-        elif all(np.linalg.norm(answer[0].camera_m - other.camera_m) > radius_m for other, _ in found):
-            found.append(answer)
-            faintest = brightness[id(blob)]
+        answers, why = _discs_of(look, blob, blobs)
+        if not answers:
+            rejected.append(Rejected(blob.pixel, why, blob.outline))
+        for answer in answers:
+            if all(np.linalg.norm(answer[0].camera_m - other.camera_m) > radius_m for other, _ in found):
+                found.append(answer)
+                faintest = brightness[id(blob)]
     discs = sorted(_correlated(found), key=lambda disc: (float(disc.pixel[1]), float(disc.pixel[0])))
     apart = [one for one in rejected if not any(_covers(one, disc) for disc in discs)]
     return Sighting(tuple(discs), tuple(apart))
+
+
+def _discs_of(look: _Look, blob: Blob, blobs: list[Blob]) -> tuple[list[tuple[Disc, Circle]], str]:
+    """Returns the disc that a blob is, or those that have run into one in it; or why there is none."""
+    answer = look.at(blob, blobs)
+    if not isinstance(answer, str):
+        return [answer], ""
+    inner = best_of(blob.within)
+    parts = [look.at(one, blobs + inner) for one in inner]
+    return [part for part in parts if not isinstance(part, str)], answer
 
 
 class _Look:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -20,7 +21,10 @@ _VERY_ROUND = 0.93  # of 1, which an ellipse has
 ROUND = 0.80
 """Share of its ellipse's area below which a blob is certainly no disc."""
 _SMALL = 0.6  # of the smallest disc
+_CORES = (0.6, 0.75, 0.88)  # of the way to a blob's border: its neck may be nearly as wide as it is
 _SAME_PLACE = 0.6  # of a semi-axis: centres closer than this belong to one blob
+_MUCH_SMALLER = 0.75
+_LONG = 1.5  # times as long as wide: it may be two discs
 _LEAST_CONTRAST = 4.0  # of the distance between the background's median and 80 %
 
 
@@ -35,6 +39,7 @@ class Blob:
         level: The threshold that shows it, in the image's counts.
         outline: (n, 2) px, its border.
         cut: Whether it reaches the image's border.
+        within: Much smaller blobs of the same place at other thresholds, in case it is several discs in one.
     """
 
     pixel: Float64
@@ -43,6 +48,7 @@ class Blob:
     level: float
     outline: Float64
     cut: bool
+    within: tuple[Blob, ...] = ()
 
     @property
     def semi_axes(self) -> tuple[float, float]:
@@ -93,7 +99,7 @@ def find_blobs(ir: NDArray[Any], smallest_px: float, largest_px: float) -> list[
     for level in np.geomspace(max(low, 1.0), max(high, 1.0), _LEVELS + 1)[:-1]:
         found += _at(image, float(level), float(level) * counts, smallest_px, largest_px)
     middle = _middle(low, high) * counts
-    return [blob for blob in _best(found) if blob.roundness >= ROUND or blob.level >= middle]
+    return [blob for blob in best_of(found) if blob.roundness >= ROUND or blob.level >= middle]
 
 
 def _despeckled(ir: NDArray[Any], smallest_px: float) -> tuple[NDArray[np.uint8], float]:
@@ -146,18 +152,20 @@ def _at(
         if blob is None or blob.semi_axes[0] > 2.2 * largest_px:
             continue
         blobs.append(blob)
-        if blob.roundness < _VERY_ROUND:
-            blobs += _parted(contour, image.shape, counts)
+        if blob.roundness < _VERY_ROUND or blob.semi_axes[0] > _LONG * blob.semi_axes[1]:
+            blobs += _parted(contour, blob, image.shape)
     return blobs
 
 
-def _blob(contour: NDArray[Any], shape: tuple[int, ...], level: float) -> Blob | None:
+def _blob(
+    contour: NDArray[Any], shape: tuple[int, ...], level: float, least_px: float = _LEAST_AREA_PX
+) -> Blob | None:
     x, y, w, h = cv2.boundingRect(contour)
     filled = np.zeros((h, w), np.uint8)
     cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
     moments = cv2.moments(filled, binaryImage=True)
     area = moments["m00"]
-    if area < _LEAST_AREA_PX:
+    if area < least_px:
         return None
     # A pixel is a square, whose own second moment of 1/12 the sum over its centres leaves out.
     covariance = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
@@ -169,32 +177,32 @@ def _blob(contour: NDArray[Any], shape: tuple[int, ...], level: float) -> Blob |
     return Blob(centre, covariance, float(area / ellipse), level, outline, cut)
 
 
-def _parted(contour: NDArray[Any], shape: tuple[int, ...], level: float) -> list[Blob]:
+def _parted(contour: NDArray[Any], blob: Blob, shape: tuple[int, ...]) -> list[Blob]:
     """Returns the cores of a blob that is several discs run into one: where its border is far away."""
     x, y, w, h = cv2.boundingRect(contour)
     filled = np.zeros((h + 2, w + 2), np.uint8)
     cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED, offset=(1 - x, 1 - y))
     inside = np.asarray(cv2.distanceTransform(filled, cv2.DIST_L2, 5), np.float32)
     deepest = float(inside.max())
-    cores, _ = cv2.findContours(
-        (inside > 0.6 * deepest).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )
-    if len(cores) < 2:
-        return []
-    parts = []
-    for core in cores:
-        blob = _blob(core + np.array([x - 1, y - 1], core.dtype), shape, level)
-        if blob is None:
-            continue
-        # The core lies everywhere as far inside of the disc's outline.
-        values, axes = np.linalg.eigh(blob.covariance)
-        grown = (np.sqrt(values) + 0.6 * deepest / 2) ** 2
-        parts.append(Blob(blob.pixel, axes @ np.diag(grown) @ axes.T, ROUND, level, blob.outline, blob.cut))
-    return parts
+    for depth in (share * deepest for share in _CORES):
+        binary = (inside > depth).astype(np.uint8)
+        cores, _ = cv2.findContours(binary, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        parts = [_blob(core + np.array([x - 1, y - 1], core.dtype), shape, blob.level, 4) for core in cores]
+        whole = [part for part in parts if part is not None]
+        if len(whole) > 1:
+            return [_grown(part, blob, depth) for part in whole]
+    return []
 
 
-def _best(blobs: list[Blob]) -> list[Blob]:
-    """Keeps the roundest blob of each place; of those alike, that of the lowest threshold."""
+def _grown(core: Blob, whole: Blob, by_px: float) -> Blob:
+    """A core with what lies around it everywhere; anything round by itself goes before it."""
+    values, axes = np.linalg.eigh(core.covariance)
+    covariance = axes @ np.diag((np.sqrt(values) + by_px / 2) ** 2) @ axes.T
+    return Blob(core.pixel, covariance, ROUND, core.level, whole.outline, whole.cut)
+
+
+def best_of(blobs: Sequence[Blob]) -> list[Blob]:
+    """Returns the roundest blob of each place; of those alike, that of the lowest threshold."""
     ranked = sorted(blobs, key=lambda b: (-min(b.roundness, _VERY_ROUND), b.level, tuple(b.pixel)))
     if not ranked:
         return []
@@ -208,8 +216,17 @@ def _best(blobs: list[Blob]) -> list[Blob]:
     ) / (4 * np.linalg.det(spread)[:, None])
     within = squared <= _SAME_PLACE**2  # the centre of j within the core of i
     same = within | within.T
+    longest = np.array([blob.semi_axes[0] for blob in ranked])
     kept: list[int] = []
     for number in range(len(ranked)):
         if not same[number, kept].any():
             kept.append(number)
-    return [ranked[number] for number in kept]
+    return [
+        replace(
+            ranked[number],
+            within=tuple(
+                ranked[i] for i in np.flatnonzero(same[number] & (longest < _MUCH_SMALLER * longest[number]))
+            ),
+        )
+        for number in kept
+    ]

@@ -221,6 +221,7 @@ def _solved(
     influence, slope = tukey(residual / limit)
     inverse_hessian = np.linalg.inv((a * slope[:, None]).T @ a + scale**2 * prior)
     variance = limit**2 * float((influence**2).sum()) / max(1, int(np.count_nonzero(influence)) - 3)
+    variance = max(variance, _LEAST_SCALE_PX**2)
     covariance = (variance * inverse_hessian @ (a.T @ a) @ inverse_hessian)[:2, :2]
     arcs = max(8, round(2 * np.pi * radius_px / _ARC_PX))
     scores = np.zeros((arcs, 3))

@@ -126,7 +126,7 @@ def _fit(readings: Readings, ring_only: bool) -> InversePlane | None:
         solution = np.linalg.lstsq(
             rows * np.sqrt(weights)[:, None], readings.inverse * np.sqrt(weights), rcond=None
         )[0]
-    covariance = _covariance(rows, readings, readings.inverse - rows @ solution, _TUKEY * scale)
+    covariance = _covariance(rows, readings, readings.inverse - rows @ solution, _TUKEY * scale, floor)
     back = np.array([[1, 0, 0], [0, 1, 0], [-origin[0], -origin[1], 1]])  # to rays from the axis
     inverse = back @ solution
     return InversePlane(inverse, back @ covariance @ back.T, int(np.count_nonzero(weights)), ring_only)
@@ -148,15 +148,16 @@ def _start(rows: Float64, inverse: Float64) -> Float64 | None:
     return best
 
 
-def _covariance(rows: Float64, readings: Readings, residual: Float64, limit: float) -> Float64:
+def _covariance(rows: Float64, readings: Readings, residual: Float64, limit: float, floor: float) -> Float64:
     """Returns (3, 3) the covariance that holds although neighbours share noise and the sensor's steps.
 
     A sandwich over blocks (Liang and Zeger 1986) of the M-estimator's derivative (Huber 1981), but never
-    below what independent readings would give.
+    below what independent readings would give, nor below `floor` (1/m) for each.
     """
     influence, slope = tukey(residual / limit)
     inverse_hessian = np.linalg.inv((rows * slope[:, None]).T @ rows)
     variance = limit**2 * float((influence**2).sum()) / max(1, int(np.count_nonzero(influence)) - 3)
+    variance = max(variance, floor**2)
     formal: Float64 = variance * inverse_hessian @ (rows.T @ rows) @ inverse_hessian
     side = 1 + max(np.ptp(readings.column), np.ptp(readings.row)) // _BLOCKS
     _, member = np.unique((readings.row // side) * 10_000 + readings.column // side, return_inverse=True)

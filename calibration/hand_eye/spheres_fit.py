@@ -18,6 +18,8 @@ from surfclass.types import Bool, Float64, Transform
 LEAST_POSES = 6
 _FARTHEST = 20.0  # of the spheres' distance: where on the line the tool centre is looked for
 _LEAST_TURN_RAD = np.radians(1.0)
+_GRID = 81
+_LEAST_WIDTH = 1e-3  # of the tool centres across their longest direction, as a share of it
 _OUTLIER = 4.0  # times the middle pose's miss
 _OUTLIER_M = 0.001
 
@@ -76,6 +78,9 @@ def fit_spheres(pairs: Sequence[SpherePair], tool_base_m: Float64) -> SpheresFit
             f"spheres: the rod points the same way within {np.degrees(turn):.2f}° in all poses, so where on "
             "it the tool centre lies stays open; tilt the tool by 5° or more between poses"
         )
+    width = np.linalg.svd(tool - tool.mean(axis=0), compute_uv=False)
+    if width[1] <= _LEAST_WIDTH * width[0]:
+        raise RefusedError("spheres: the tool centres lie on a line; move the tool in all three directions")
     reach = _FARTHEST * float(np.median([pair.distance_m for pair in pairs]))
     used = np.ones(len(tool), bool)
     for _ in range(len(tool)):
@@ -107,10 +112,11 @@ def _left_out(
 ) -> tuple[Float64, list[tuple[Transform, float]]]:
     """Returns each pose's miss by a fit without it, and those fits of the poses that are used."""
     misses, estimates = np.zeros(len(tool)), []
+    _, near = _posed(middle[used], axis[used], tool[used], reach)
     for number in range(len(tool)):
         others = used.copy()
         others[number] = False
-        pose, along = _posed(middle[others], axis[others], tool[others], reach)
+        pose, along = _posed(middle[others], axis[others], tool[others], reach, near)
         seen = pose @ (middle[number] + along * axis[number])
         misses[number] = float(np.linalg.norm(seen - tool[number]))
         if used[number]:
@@ -118,25 +124,35 @@ def _left_out(
     return misses, estimates
 
 
-def _posed(middle: Float64, axis: Float64, tool: Float64, reach: float) -> tuple[Transform, float]:
-    """Returns the pose and the place on the rod's line that together leave least: one number is searched."""
+def _posed(
+    middle: Float64, axis: Float64, tool: Float64, reach: float, near: float | None = None
+) -> tuple[Transform, float]:
+    """Returns the pose and the place on the rod's line that together leave least: one number is searched.
+
+    Near `near` if that is given, else all over `reach` to both sides.
+    """
     from scipy.optimize import minimize_scalar
 
-    def placed(along: float) -> Transform:
-        try:
-            return align(middle + along * axis, tool, "base", "camera")
-        except InputError as error:
-            raise RefusedError(f"spheres: {error}; move the tool in all three directions") from error
+    centred = tool - tool.mean(axis=0)
+    middles, axes = middle - middle.mean(axis=0), axis - axis.mean(axis=0)
+    of_middle, of_axis = middles.T @ centred, axes.T @ centred
 
     def misfit(along: float) -> float:
-        left = placed(along) @ (middle + along * axis) - tool
-        return float(np.sum(left**2))
+        # The least that any rigid motion leaves (Arun, Huang and Blostein 1987), less a constant.
+        cross = of_middle + along * of_axis
+        u, values, vt = np.linalg.svd(cross)
+        handed = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+        spread = float(np.sum((middles + along * axes) ** 2))
+        return spread - 2 * float(values[0] + values[1] + handed * values[2])
 
-    grid = np.linspace(-reach, reach, 81)
-    start = float(grid[int(np.argmin([misfit(along) for along in grid]))])
+    grid = np.linspace(-reach, reach, _GRID)
     step = float(grid[1] - grid[0])
+    start = near if near is not None else float(grid[int(np.argmin([misfit(along) for along in grid]))])
     found = minimize_scalar(
-        misfit, bounds=(start - step, start + step), method="bounded", options={"xatol": 1e-7}
+        misfit, bounds=(start - step, start + step), method="bounded", options={"xatol": 1e-8}
     )
     along = float(found.x)
-    return placed(along), along
+    try:
+        return align(middle + along * axis, tool, "base", "camera"), along
+    except InputError as error:
+        raise RefusedError(f"spheres: {error}; move the tool in all three directions") from error
