@@ -34,6 +34,19 @@ def cell():
     return rig, labels, seen
 
 
+def test_a_view_whose_depth_is_corrected_sees_the_same_places(cell):
+    rig, _, seen = cell
+    world = SimWorld("cell", seed=3, scale=SCALE)
+    q = world.viewpoints[0].q
+    depth_mm, _ = world.render_depth(q, 0)
+    wrong = np.rint(depth_mm / 0.95).astype(np.uint16)
+    corrected = rig.with_values({"depth_correction": {"multiplier": [0.95]}})
+    again = seen_points(DepthFrame(0, 0, None, wrong), truth.base_T_depth(world, q), corrected)
+    both = again.has_point & seen[0].has_point
+    assert both.mean() > 0.8
+    assert np.abs(again.point_base - seen[0].point_base)[:, both].max() < 0.002
+
+
 def away_from_edges(label, reach_px):
     kernel = np.ones((2 * reach_px + 1,) * 2, np.uint8)
     return cv2.dilate(label, kernel) == cv2.erode(label, kernel)

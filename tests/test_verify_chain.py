@@ -12,6 +12,7 @@ from calibration.verify.card import block_means, variation
 from calibration.verify.command import VerifyOptions, verify
 from calibration.verify.discs import DiscErrors, explain
 from drivers.recordings import Recording, RecordingWriter
+from drivers.recordings.board import Board
 from drivers.sim import truth
 from drivers.sim.views import Look, reach
 from drivers.sim.world import SimWorld
@@ -20,7 +21,7 @@ from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
 
 SCALE = 0.5
 PLAN = {"reflector_discs": "hand_eye", "grey_card": "response", "checkerboard": "board"}
-BOARD = "columns = 9\nrows = 6\nsquare_m = 0.025\n"
+BOARD = Board(columns=9, rows=6, square_m=0.025)
 GATES = VerifyGates()
 
 
@@ -40,8 +41,7 @@ def site(tmp_path_factory):
             world = worlds[scene]
             for number, view in enumerate(chosen(world, scene)):
                 writer.write(seen(world, role, number, view.q))
-    (folder / "board.toml").write_text(BOARD)
-    return path, folder / "board.toml"
+    return path, BOARD
 
 
 def chosen(world, scene):
@@ -180,9 +180,7 @@ def test_an_overexposed_card_is_left_out_with_a_note_and_does_not_decide(site, t
 
 
 def test_a_wrong_board_or_a_blind_image_leaves_the_cameras_unchecked(site, tmp_path):
-    wrong = tmp_path / "board.toml"
-    wrong.write_text(BOARD.replace("0.025", "0.030"))
-    outcome = checked((site[0], wrong))
+    outcome = checked((site[0], BOARD.model_copy(update={"square_m": 0.030})))
     assert "the board's squares have another size" in outcome.reasons[0] or "depth" in outcome.reasons[0]
     blind = rewritten(
         site,

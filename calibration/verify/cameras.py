@@ -17,7 +17,7 @@ from calibration.rotations import rotation_matrix
 from calibration.source import Source
 from calibration.verify.part import Finding, Part
 from surfclass.frames import Capture
-from surfclass.geometry import depth_to_points, project
+from surfclass.geometry import corrected_depth, depth_to_points, project
 from surfclass.rig import Camera, Rig
 from surfclass.types import Bool, Float64, Transform
 
@@ -58,7 +58,7 @@ def check_cameras(source: Source, board: Board | None, gates: VerifyGates, note:
     if not source.count("board"):
         raise RefusedError("no capture of role board shows the checkerboard")
     if board is None:
-        raise RefusedError("there is no board.toml that says what the board is")
+        raise RefusedError("nothing says what board the captures of role board show: there is no board.toml")
     rig = source.rig.whole()
     views = []
     for capture in source.captures("board"):
@@ -102,7 +102,7 @@ def depth_error(
     depth_mm: NDArray[np.uint16], where: Bool, depth_T_board: Transform, rig: Rig
 ) -> float | None:
     """Returns the median of measured over true depth, less 1, of the board's pixels; None if they are few."""
-    points = depth_to_points(depth_mm, rig.depth)[:, where].T.astype(np.float64)
+    points = depth_to_points(corrected_depth(depth_mm, rig), rig.depth)[:, where].T.astype(np.float64)
     points = points[points[:, 2] > 0]
     if len(points) < _LEAST_READINGS:
         return None

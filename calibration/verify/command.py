@@ -12,8 +12,7 @@ from calibration.outcome import SCHEMA, Figures, Note, Outcome, RefusedError
 from calibration.source import Source
 from calibration.verify import boards, cameras, card, discs
 from calibration.verify.part import Part
-from drivers.files import read_file
-from drivers.recordings.board import Board, parse_board
+from drivers.recordings.board import Board
 from surfclass.errors import ConfigurationError, InputError
 
 PARTS = {one.KEY: one.TITLE for one in (cameras, discs, card, boards)}
@@ -25,13 +24,13 @@ class VerifyOptions:
 
     Attributes:
         model: The model that labelled captures are classified with; None leaves them out.
-        board: A `board.toml` that says what `board` captures look at.
+        board: What `board` captures look at; None leaves them out.
         require: Parts that have to be checked, out of PARTS: one that cannot be is a failure. What else
             the captures allow is checked too.
     """
 
     model: Path | None = None
-    board: Path | None = None
+    board: Board | None = None
     require: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -44,7 +43,7 @@ def verify(source: Source, options: VerifyOptions, gates: VerifyGates, note: Not
 
     | role | what is checked |
     | --- | --- |
-    | `board`, with board.toml | both cameras, what is between them, depth |
+    | `board` | both cameras, what is between them, depth |
     | `hand_eye`, with plate.toml | hand-eye, arm and depth: discs in the base frame |
     | `response` | light, response and vignetting: K_d of a grey card |
     | `test`, `train`, with a model | the whole method: labelled pixels |
@@ -59,7 +58,7 @@ def verify(source: Source, options: VerifyOptions, gates: VerifyGates, note: Not
         RefusedError: If nothing at all can be checked.
     """
     checks: dict[str, Callable[[], Part]] = {
-        cameras.KEY: lambda: cameras.check_cameras(source, _board(options), gates, note),
+        cameras.KEY: lambda: cameras.check_cameras(source, options.board, gates, note),
         discs.KEY: lambda: discs.check_discs(source, gates, note),
         card.KEY: lambda: card.check_card(source, gates, note),
         boards.KEY: lambda: boards.check_boards(source, options.model, gates, note),
@@ -121,9 +120,3 @@ def _sentence(part: Part) -> str:
         return f"{part.title} not checked"
     first = part.findings[0]
     return f"{part.title} {first.told} ({first.allowed})"
-
-
-def _board(options: VerifyOptions) -> Board | None:
-    if options.board is None:
-        return None
-    return parse_board(read_file(options.board, "board"), str(options.board))
