@@ -98,7 +98,7 @@ def read_plane(
     if len(rows) < 3:
         return None
     middle = np.nanmedian(blocks[rows, columns], axis=-1)
-    centre: Float64 = np.stack([columns, rows], axis=1) * float(_BLOCK_PX) + (_BLOCK_PX - 1) / 2
+    centre = np.asarray(np.stack([columns, rows], axis=1) * _BLOCK_PX + (_BLOCK_PX - 1) / 2, np.float64)
     plane = cv2.remap(
         np.where(np.isfinite(z), z, 0).astype(np.float32),
         centre[:, 0].astype(np.float32),

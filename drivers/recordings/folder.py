@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.recordings.board import Board, parse_board
 from drivers.recordings.captures_csv import Row, read_captures_csv
 from drivers.recordings.images import check_pixels, decode_image
 from drivers.recordings.plate import Plate, parse_plate
@@ -41,6 +42,8 @@ class FolderSet:
         classes: What it says, or None.
         plate_text: `plate.toml` as it stands, or None.
         plate: What it says, or None.
+        board_text: `board.toml` as it stands, or None.
+        board: What it says, or None.
         rows: `captures.csv`.
         files: For each row its image files, by kind: "depth", "colour", "dark", "ir", "label".
     """
@@ -52,6 +55,8 @@ class FolderSet:
     classes: SurfaceClasses | None
     plate_text: str | None
     plate: Plate | None
+    board_text: str | None
+    board: Board | None
     rows: tuple[Row, ...]
     files: tuple[dict[str, Path], ...]
 
@@ -116,11 +121,13 @@ def read_folder(directory: str | Path) -> FolderSet:
     rig_path = folder / "rig.toml"
     rig_text = _read_text(rig_path, "every data folder has one")
     needs_classes = "label" in {kind for found in files for kind in found} or roles & _NEED_CLASSES
-    classes_text = plate_text = None
+    classes_text = plate_text = board_text = None
     if needs_classes or (folder / "classes.toml").exists():
         classes_text = _read_text(folder / "classes.toml", "train, test, map and labelled captures need it")
     if "hand_eye" in roles or (folder / "plate.toml").exists():
         plate_text = _read_text(folder / "plate.toml", "hand_eye captures need it")
+    if (folder / "board.toml").exists():
+        board_text = _read_text(folder / "board.toml", "board captures look at it")
     return FolderSet(
         path=folder,
         rig_text=rig_text,
@@ -129,6 +136,8 @@ def read_folder(directory: str | Path) -> FolderSet:
         classes=None if classes_text is None else parse_classes(classes_text, str(folder / "classes.toml")),
         plate_text=plate_text,
         plate=None if plate_text is None else parse_plate(plate_text, str(folder / "plate.toml")),
+        board_text=board_text,
+        board=None if board_text is None else parse_board(board_text, str(folder / "board.toml")),
         rows=rows,
         files=files,
     )

@@ -1,7 +1,7 @@
 """What a recording holds: topics, schemas, and one capture as messages and back.
 
 A recording is an MCAP file without a profile. The metadata record `surfclass.recording` and the
-attachments `rig.toml`, `classes.toml` and `plate.toml` come first, so that even an unfinished file says
+attachments (`rig.toml` and the others that there are) come first, so that even an unfinished file says
 what it is. Each capture is one message a part, `/capture` last: it lists the parts and closes them.
 """
 
@@ -31,7 +31,7 @@ from surfclass.types import Transform
 
 SCHEMA = "1"
 METADATA = "surfclass.recording"
-RIG, CLASSES, PLATE = "rig.toml", "classes.toml", "plate.toml"
+RIG, CLASSES, PLATE, BOARD = "rig.toml", "classes.toml", "plate.toml", "board.toml"
 CAPTURE, JOINTS, MAP = "/capture", "/joints", "/map"
 IMAGES = ("depth", "ir", "colour", "dark", "label")  # in the order in which they are written
 

@@ -16,8 +16,10 @@ from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
+from drivers.recordings.board import Board, parse_board
 from drivers.recordings.file import ACTIVE, check_digests, own_keys
 from drivers.recordings.format import (
+    BOARD,
     CAPTURE,
     CAPTURE_SCHEMA,
     CLASSES,
@@ -65,6 +67,8 @@ class Recording:
         classes: What it says, or None.
         plate_text: `plate.toml` as it was, or None.
         plate: What it says, or None.
+        board_text: `board.toml` as it was, or None.
+        board: What it says, or None.
         metadata: The writer's keys.
         unix_offset_ns: What takes the captures' times to Unix time.
         count: Number of captures.
@@ -77,6 +81,8 @@ class Recording:
     classes: SurfaceClasses | None
     plate_text: str | None
     plate: Plate | None
+    board_text: str | None
+    board: Board | None
     metadata: Mapping[str, str]
     unix_offset_ns: int
     count: int
@@ -106,9 +112,11 @@ class Recording:
             counts = summary.statistics.channel_message_counts
             closing = [number for number, channel in summary.channels.items() if channel.topic == CAPTURE]
             texts = {
-                name: attachments[name].decode() for name in (RIG, CLASSES, PLATE) if name in attachments
+                name: attachments[name].decode()
+                for name in (RIG, CLASSES, PLATE, BOARD)
+                if name in attachments
             }
-            classes, plate = texts.get(CLASSES), texts.get(PLATE)
+            classes, plate, board = (texts.get(name) for name in (CLASSES, PLATE, BOARD))
             return cls(
                 path=path,
                 rig_text=texts[RIG],
@@ -117,6 +125,8 @@ class Recording:
                 classes=None if classes is None else parse_classes(classes, f"{path}: {CLASSES}"),
                 plate_text=plate,
                 plate=None if plate is None else parse_plate(plate, f"{path}: {PLATE}"),
+                board_text=board,
+                board=None if board is None else parse_board(board, f"{path}: {BOARD}"),
                 metadata={key: value for key, value in own_keys(record).items() if key != OFFSET},
                 unix_offset_ns=int(record.get(OFFSET, "0")),
                 count=sum(counts.get(number, 0) for number in closing),

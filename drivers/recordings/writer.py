@@ -8,8 +8,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from drivers.recordings.board import parse_board
 from drivers.recordings.file import ACTIVE, RecordingFile
-from drivers.recordings.format import CLASSES, MAP, MAP_SCHEMA, PLATE, RIG, Entry, capture_entries
+from drivers.recordings.format import BOARD, CLASSES, MAP, MAP_SCHEMA, PLATE, RIG, Entry, capture_entries
 from drivers.recordings.plate import parse_plate
 from surfclass.errors import ConfigurationError, InputError
 from surfclass.frames import Capture
@@ -40,6 +41,7 @@ class RecordingWriter:
         classes_text: `classes.toml`, or None where the captures have no labels.
         metadata: Anything that should travel with it: robot, software version, source.
         plate_text: `plate.toml`, for hand-eye captures.
+        board_text: `board.toml`, for board captures.
         unix_offset_ns: What takes the captures' times to Unix time; 0 leaves them, for imported sets.
         map_schema: The serialised FileDescriptorSet of `surfclass.v1.MapUpdate`; None: no updates.
 
@@ -57,6 +59,7 @@ class RecordingWriter:
         metadata: Mapping[str, str] = _NO_METADATA,
         *,
         plate_text: str | None = None,
+        board_text: str | None = None,
         unix_offset_ns: int = 0,
         map_schema: bytes | None = None,
     ) -> None:
@@ -70,6 +73,9 @@ class RecordingWriter:
         if plate_text is not None:
             parse_plate(plate_text, f"{self.path}: {PLATE}")
             texts[PLATE] = plate_text
+        if board_text is not None:
+            parse_board(board_text, f"{self.path}: {BOARD}")
+            texts[BOARD] = board_text
         for key in metadata:
             if key in (OFFSET, "schema") or key.startswith("sha256"):
                 raise ConfigurationError(f"{self.path}: the metadata key {key!r} is the recording's own")
