@@ -200,7 +200,8 @@ setTimeout(() => {
     notice: text("notice"), bar: made.done.style.width, picture: made.picture.src ?? null,
     judged: made.judged.children.map((one) => [one.textContent, one.className]),
     coverage: made.coverage.children.map((one) => one.children.map((part) => [part.kind, part.textContent,
-      part.value ?? null, part.cells?.length ?? 0])), last: [text("last"), made.last.className], disabled: made.capture.disabled, posted}));
+      part.value ?? null, part.cells?.length ?? 0])),
+    last: [text("last"), made.last.className], disabled: made.capture.disabled, posted}));
   process.exit(0);
 }, 100);
 """
