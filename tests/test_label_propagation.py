@@ -43,7 +43,7 @@ def test_a_view_whose_depth_is_corrected_sees_the_same_places(cell):
     corrected = rig.with_values({"depth_correction": {"multiplier": [0.95]}})
     again = seen_points(DepthFrame(0, 0, None, wrong), truth.base_T_depth(world, q), corrected)
     both = again.has_point & seen[0].has_point
-    assert both.mean() > 0.8
+    assert both.mean() > 0.7
     assert np.abs(again.point_base - seen[0].point_base)[:, both].max() < 0.002
 
 

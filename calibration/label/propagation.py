@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from surfclass.errors import InputError
 from surfclass.frames import DepthFrame
-from surfclass.geometry import corrected_depth, register
+from surfclass.geometry import register
 from surfclass.rig import Rig
 from surfclass.types import Bool, Float32, Transform
 from surfclass.voxel_index import Keys, check_size, pack, voxel_of
@@ -50,7 +50,7 @@ def seen_points(depth: DepthFrame, base_T_depth: Transform, rig: Rig) -> SeenPoi
     Raises:
         InputError: If the depth image has not the rig's size.
     """
-    registered = register(corrected_depth(depth.depth_mm, rig), rig)
+    registered = register(depth.depth_mm, rig)
     stride = max(1, rig.rgb.size[0] // _PLENTY_PX)
     grid = slice(None, None, stride)
     point = np.ascontiguousarray(registered.point[:, grid, grid])
