@@ -17,6 +17,8 @@ from surfclass.errors import ConfigurationError
 BOARD_X_M = 1.62
 BOARD_Z_M = 0.84
 DISC_RADIUS_M = 0.030
+CHECKERBOARD_SQUARES = (10, 7)
+CHECKERBOARD_SIDE_M = 0.025
 DISC_PLACES_M = (
     (0.07, 0.08), (0.25, 0.07), (0.46, 0.09),
     (0.08, 0.22), (0.29, 0.24), (0.47, 0.23),
@@ -103,14 +105,15 @@ def _limits(material: str) -> Scene:
 
 
 def _checkerboard() -> Scene:
-    x, side = 1.46, 0.025
+    x, side = 1.46, CHECKERBOARD_SIDE_M
+    columns, rows = CHECKERBOARD_SQUARES
     # 72 texels a square: its edges then lie on texels' borders, and the board is as true as it says.
     board = upright(
         "checkerboard",
         (x, 0.0, 0.65),
         (0.30, 0.225),
         ("white", "black"),
-        checker(side, 10, 7),
+        checker(side, columns, rows),
         coarseness=side / (72 * TEXEL_M),
     )
     # Chosen for what they tell of both cameras and of where they are to each other: near and tilted, all

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drivers.sim.materials import CLASS_COLOURS, CLASS_NAMES, MATERIALS
 from drivers.sim.raycast import crop_of
 from drivers.sim.reflection import footprint, points_of
-from drivers.sim.scenes import DISC_PLACES_M, DISC_RADIUS_M
+from drivers.sim.scenes import CHECKERBOARD_SIDE_M, CHECKERBOARD_SQUARES, DISC_PLACES_M, DISC_RADIUS_M
 from drivers.sim.world import SimWorld
 from surfclass.errors import ConfigurationError
 from surfclass.rig import Camera
@@ -119,6 +119,12 @@ def plate_toml(world: SimWorld) -> str:
     centres = [plate.corner + s * plate.along_s + t * plate.along_t for s, t in DISC_PLACES_M]
     rows = ",\n".join(f"  {_numbers(centre)}" for centre in centres)
     return f"disc_radius_m = {DISC_RADIUS_M}\npositions_base_m = [\n{rows},\n]\n"
+
+
+def board_toml() -> str:
+    """Returns the text of `board.toml`: the checkerboard of the scene of that name."""
+    columns, rows = CHECKERBOARD_SQUARES
+    return f"columns = {columns - 1}\nrows = {rows - 1}\nsquare_m = {CHECKERBOARD_SIDE_M}\n"
 
 
 def rig(world: SimWorld, raw: bool = False) -> str:
