@@ -94,8 +94,11 @@ def with_poses(observations, change):
     return replace(observations, views=tuple(views))
 
 
-def arm_looks(rng, count, target, offsets=None, joint_sd=0.0, probed_sd=None):
-    """What the VM-6083 saw of a target in front of it, in space: its joints read with offsets and noise."""
+def arm_looks(rng, count, target, offsets=None, joint_sd=0.0, probed_sd=None, still=()):
+    """What the VM-6083 saw of a target in front of it, in space: its joints read with offsets and noise.
+
+    The joints (0…5) that are `still` do not move.
+    """
     offsets = np.zeros(6) if offsets is None else np.asarray(offsets)
     middle = np.radians([0.0, 20.0, 90.0, 0.0, -20.0, 0.0])
     base_T_camera = forward_kinematics(middle) @ FLANGE_T_CAMERA
@@ -103,7 +106,8 @@ def arm_looks(rng, count, target, offsets=None, joint_sd=0.0, probed_sd=None):
     base_T_target = base_T_camera @ place
     views = []
     for number in range(count):
-        q = middle + rng.uniform(-1, 1, 6) * np.radians([15, 12, 12, 40, 25, 60])
+        moves = np.where(np.isin(np.arange(6), still), 0, np.radians([15, 12, 12, 40, 25, 60]))
+        q = middle + rng.uniform(-1, 1, 6) * moves
         camera_T_target = (forward_kinematics(q) @ FLANGE_T_CAMERA).inverse @ base_T_target
         seen = camera_T_target @ target
         read = q - offsets + rng.normal(0, joint_sd, 6) if joint_sd else q - offsets

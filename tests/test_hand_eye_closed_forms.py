@@ -23,7 +23,8 @@ def pairs(x, count=8, seed=0, noise=0.0):
         [transform("a", "b", rng.normal(size=3), rng.normal(size=3)).matrix for _ in range(count)]
     )
     shaken = [
-        transform("a", "b", noise * rng.normal(size=3), noise * rng.normal(size=3)).matrix for _ in range(count)
+        transform("a", "b", noise * rng.normal(size=3), noise * rng.normal(size=3)).matrix
+        for _ in range(count)
     ]
     return flange, np.linalg.inv(flange @ x) @ y @ np.stack(shaken)
 

@@ -21,6 +21,7 @@ from calibration.hand_eye.problem import Problem
 from surfclass.types import Bool, Float64
 
 _CAUCHY = 25.0  # square of the Cauchy loss's width, in standard deviations of a single number
+_LEAST_SIZE = 0.05  # of a deviation in standard deviations, for its weight in other than Gaussian noise
 _NULL = 1e-13  # of the normal matrix's greatest eigenvalue; what lies below is not determined
 
 
@@ -35,6 +36,8 @@ class Noise:
         probed: Factor on the probed points' own.
         turn: rad, of an arm's pose about each axis; with joint angles: of each joint.
         shift: m, of an arm's pose along each axis; unused with joint angles.
+        shape: Exponent of the deviations' distribution, exp(−|v|^shape): 2 is Gaussian, more has
+            lighter tails (Subbotin 1923).
     """
 
     pixel: float = 0.3
@@ -43,6 +46,7 @@ class Noise:
     probed: float = 1.0
     turn: float = 2e-4
     shift: float = 2e-4
+    shape: float = 2.0
 
     def deviation(self, joints: bool) -> Float64:
         """(6,) of a pose's deviation."""
@@ -164,9 +168,12 @@ def system_of(
     if not free.deviations:
         total = replace(total, cross=0 * total.cross, right_deviation=0 * total.right_deviation)
     sd = noise.deviation(problem.jacobian is not None)
-    inner = np.asarray(np.linalg.inv(total.deviation + np.diag(1 / sd**2)), np.float64)
-    total = replace(total, right_deviation=total.right_deviation - state.deviation / sd**2)
-    cost += float(np.sum((state.deviation / sd) ** 2))
+    size_of = np.abs(state.deviation / sd)
+    weight = np.maximum(size_of, _LEAST_SIZE) ** (noise.shape - 2)
+    prior = np.eye(6) * (weight / sd**2)[:, None, :]
+    inner = np.asarray(np.linalg.inv(total.deviation + prior), np.float64)
+    total = replace(total, right_deviation=total.right_deviation - weight * state.deviation / sd**2)
+    cost += float(np.sum(2 / noise.shape * size_of**noise.shape))
     reduced: Float64 = total.global_ - np.einsum("ngi,nij,nhj->gh", total.cross, inner, total.cross)
     return System(total, inner, reduced, cost, groups, squares, pixel_weight, position_weight)
 

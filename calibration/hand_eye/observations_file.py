@@ -57,14 +57,14 @@ class _Pose(Table):
     name: str | None = None
     base_T_flange: Matrix4
     q: tuple[Number, Number, Number, Number, Number, Number] | None = None
-    points: tuple[_Point, ...] | None = None
+    points: tuple[_Point, ...] = ()
     camera_T_target: Matrix4 | None = None
 
     @model_validator(mode="after")
     def _one_of_two(self) -> _Pose:
-        if (self.points is None) == (self.camera_T_target is None):
+        if ("points" in self.model_fields_set) == (self.camera_T_target is not None):
             raise ValueError("needed is either points or camera_T_target")
-        places = [point.target_m for point in self.points or ()]
+        places = [point.target_m for point in self.points]
         if len(set(places)) != len(places):
             raise ValueError("two points have the same target_m")
         return self
@@ -114,7 +114,7 @@ class _File(Table):
             raise ValueError(
                 f"target_prior_{other}_m: with {self.mounting} the target is not fixed in {other}"
             )
-        pairs = {pose.points is None for pose in self.poses}
+        pairs = {pose.camera_T_target is None for pose in self.poses}
         if len(pairs) > 1:
             raise ValueError("some poses have points and others camera_T_target; all need the same")
         return self
@@ -182,8 +182,8 @@ def _view(number: int, pose: _Pose) -> View:
     if pose.camera_T_target is not None:
         seen = virtual_points(Transform("camera", "target", np.array(pose.camera_T_target)))
         return View(name, base_T_flange, positions=seen, q=q, sizeless=True)
-    shown = [point for point in pose.points or () if point.pixel is not None]
-    measured = [point for point in pose.points or () if point.camera_m is not None]
+    shown = [point for point in pose.points if point.pixel is not None]
+    measured = [point for point in pose.points if point.camera_m is not None]
     pixels = Pixels(
         np.array([point.target_m for point in shown], np.float64).reshape(-1, 3),
         np.array([point.pixel for point in shown], np.float64).reshape(-1, 2),

@@ -13,6 +13,7 @@ from calibration.hand_eye.closed_forms import pair_motions, park_martin, solve_a
 from calibration.hand_eye.problem import Problem
 from calibration.hand_eye.single_pose import align
 from calibration.outcome import RefusedError
+from calibration.projection import projected
 from calibration.rotations import rotation_matrix, rotation_vector
 from surfclass.errors import InputError
 from surfclass.types import Bool, Float64
@@ -20,6 +21,9 @@ from surfclass.types import Bool, Float64
 _SUBSETS = 60
 _SUBSET = 4
 _SEED = 5
+_FAR = 3.0  # times the middle point's residual: a mistaken point, which must not turn its whole view
+_NEAR_PX, _NEAR_M = 0.5, 0.001
+_TRIMS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,16 +157,23 @@ def mean_pose(poses: Float64) -> Float64:
 
 
 def _from_positions(problem: Problem, view: int) -> Float64 | None:
-    own = problem.positions.pose == view
-    if own.sum() < 3:
+    own = np.flatnonzero(problem.positions.pose == view)
+    if len(own) < 3:
         return None
+    points, measured = problem.target[problem.positions.point[own]], problem.positions.value[own]
     try:
-        found = align(
-            problem.target[problem.positions.point[own]], problem.positions.value[own], "camera", "target"
-        )
+        found = align(points, measured, "camera", "target")
+        good = _near(np.linalg.norm(found @ points - measured, axis=1), _NEAR_M)
+        if good.sum() >= 3:
+            found = align(points[good], measured[good], "camera", "target")
     except InputError:  # on a line
         return None
     return found.matrix
+
+
+def _near(misses: Float64, least: float) -> Bool:
+    """Which points are not far off beside the others."""
+    return misses <= max(_FAR * float(np.median(misses)), least)
 
 
 def _from_pixels(problem: Problem, view: int, intrinsics: Float64) -> Float64 | None:
@@ -174,11 +185,21 @@ def _from_pixels(problem: Problem, view: int, intrinsics: Float64) -> Float64 | 
         return None
     f = intrinsics
     matrix = np.array([[f[0], 0, f[2]], [0, f[1], f[3]], [0, 0, 1.0]])
-    found, turn, shift = cv2.solvePnP(points, pixels, matrix, f[4:], flags=cv2.SOLVEPNP_SQPNP)
-    if not found:
-        return None
-    turn, shift = cv2.solvePnPRefineLM(points, pixels, matrix, f[4:], turn, shift)
+    good = np.ones(len(points), np.bool_)
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(turn.ravel())
-    pose[:3, 3] = shift.ravel()
-    return pose if np.isfinite(pose).all() else None
+    for _ in range(_TRIMS):
+        p, uv = points[good], pixels[good]
+        found, turn, shift = cv2.solvePnP(p, uv, matrix, f[4:], flags=cv2.SOLVEPNP_SQPNP)
+        if not found:
+            return None
+        turn, shift = cv2.solvePnPRefineLM(p, uv, matrix, f[4:], turn, shift)
+        pose[:3, :3] = rotation_matrix(turn.ravel())
+        pose[:3, 3] = shift.ravel()
+        if not np.isfinite(pose).all():
+            return None
+        shown = projected(points @ pose[:3, :3].T + pose[:3, 3], f)
+        better = _near(np.linalg.norm(shown - pixels, axis=1), _NEAR_PX)
+        if better.sum() < 4 or (better == good).all():
+            break
+        good = better
+    return pose
