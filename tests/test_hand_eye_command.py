@@ -207,7 +207,7 @@ def test_poses_that_were_computed_with_a_hand_eye_cannot_tell_a_new_one(tmp_path
 
 
 def test_captures_without_the_target_that_was_asked_for_say_what_is_missing(tmp_path):
-    source = folder(tmp_path, [([0.0] * 6, None)], role="map")
+    source = folder(tmp_path, [([0.0] * 6, None)], role="exposure")
     with pytest.raises(RefusedError, match=r"without plate\.toml"):
         calibrate(source, Options(), HandEyeGates(), quiet)
     told = Options(target="checkerboard", board=Board(columns=9, rows=6, square_m=0.025))
