@@ -243,20 +243,6 @@ def test_ends_of_a_symmetric_board_that_were_taken_for_each_other_are_told_apart
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_discs_end_to_end(shared):
-    where = shared / "data/hand_eye_discs"
-    truth = json.loads((where / "truth.json").read_text())["flange_T_depth"]
-    source = Source.open(where)
-    outcome = calibrate(source, Options(), HandEyeGates(), quiet)
-    found = Transform("flange", "depth", np.array(outcome.result["flange_T_camera"]))
-    off = difference(found, Transform("flange", "depth", np.array(truth)))
-    sd = outcome.result["jackknife_sd"]
-    assert outcome.verdict == "pass"
-    assert np.linalg.norm(off[3:]) < 0.6e-3
-    assert np.linalg.norm(off[:3]) < np.radians(0.08)
-    assert (np.abs(off) < 2.5 * np.array(sd["rotation_rad"] + sd["translation_m"])).all()
-
-
 def capture_of(image, q, motion=None):
     depth = DepthFrame(0, 0, None, np.zeros((480, 640), np.uint16))
     rgb = np.repeat(image[..., None], 3, axis=2)
