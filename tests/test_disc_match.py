@@ -96,7 +96,9 @@ def world(monkeypatch):
             frame = DepthFrame(number, number, None, QUIET.depth_mm, QUIET.ir)
             sightings[number] = Sighting(tuple(disc(point) for point in seen), ())
             captures.append(Capture(f"v{number}", "hand_eye", frame, None, joints=JointState(0, 0, angles)))
-        monkeypatch.setattr(discs, "look_for_discs", lambda frame, camera, radius: sightings[frame.sequence])
+        monkeypatch.setattr(
+            discs, "look_for_discs", lambda frame, camera, radius, depth: sightings[frame.sequence]
+        )
         rig = DepthRig.model_validate({"schema": 1, "name": "t", "voxel_size_m": 0.01, "depth": CAMERA})
         known = base_m if known is None else known
         plate = Plate(disc_radius_m=RADIUS_M, positions_base_m=tuple(map(tuple, known.tolist())))
@@ -217,6 +219,32 @@ def test_views_without_enough_are_left_out_with_the_reason(world):
     ):
         assert why in note
     assert "border" in notes[0]
+
+
+def test_the_rigs_own_corrections_of_arm_and_depth_are_applied(world, monkeypatch):
+    captures, rig, plate, sightings = world(PLACES_M, q=looking(2))
+    offsets = (0.0, 0.01, 0.0, 0.0, -0.02, 0.0)
+    correction = {"multiplier": [1.02]}
+    rig = rig.with_values({"arm": {"joint_offsets_rad": offsets}, "depth_correction": correction})
+    bright = np.full(CAMERA.shape, 1000, np.uint16)
+    moved = [
+        Capture(
+            one.name, "hand_eye", DepthFrame(0, n, None, bright, QUIET.ir), None, joints=JointState(0, 0, q)
+        )
+        for n, (one, q) in enumerate((one, one.joints.q - offsets) for one in captures)
+    ]
+    readings = []
+
+    def look(frame, camera, radius, depth_mm):
+        readings.append(float(depth_mm.mean()))
+        return sightings[frame.sequence]
+
+    monkeypatch.setattr(discs, "look_for_discs", look)
+    seen = discs.observe(moved, rig, plate, lambda _: None)
+    assert readings == pytest.approx([1020.0, 1020.0], abs=0.01)
+    for view, capture in zip(seen.views, captures, strict=True):
+        assert view.q == pytest.approx(capture.joints.q)
+        assert view.base_T_flange.matrix == pytest.approx(forward_kinematics(capture.joints.q).matrix)
 
 
 def test_nothing_seen_at_all_is_refused_and_a_wrong_image_size_is_an_error(world):

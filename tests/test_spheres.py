@@ -106,7 +106,6 @@ def test_a_hidden_part_and_mixed_rim_readings_move_nothing():
     def spoil(ir, depth):
         ir, depth = ir.copy(), depth.copy()
         column = round(CX + FOCAL * centres[0][0] / centres[0][2])
-        ir[:, column + 15 :], depth[:, column + 15 :] = ir[:, column + 15 :], depth[:, column + 15 :]
         edge = (depth > 0) & (cv2.erode(depth, np.ones((5, 5))) == 0)
         depth[edge] += 0.01
         row = round(CY + FOCAL * centres[0][1] / centres[0][2])
@@ -169,7 +168,7 @@ def test_the_fixed_camera_and_the_tool_centre_are_found():
 
 def test_the_reported_spread_is_the_sampled_one():
     errors, reported = [], []
-    for seed in range(20):
+    for seed in range(14):
         fit = fit_spheres(*world(14, seed))
         away = difference(fit.base_T_camera, BASE_T_CAMERA)
         errors.append([*away[:3], *away[3:], fit.along_m - ALONG])
@@ -177,7 +176,7 @@ def test_the_reported_spread_is_the_sampled_one():
     ratio = np.sqrt(np.mean(np.square(errors), axis=0) / np.mean(np.square(reported), axis=0))
     assert ratio.min() > 0.5
     assert ratio.max() < 1.6
-    bias = np.mean(errors, axis=0) / (np.std(errors, axis=0) / np.sqrt(20))
+    bias = np.mean(errors, axis=0) / (np.std(errors, axis=0) / np.sqrt(14))
     assert np.abs(bias).max() < 3.5
 
 

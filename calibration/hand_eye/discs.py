@@ -15,7 +15,8 @@ from calibration.hand_eye.single_pose import align
 from calibration.outcome import Note, RefusedError
 from drivers.recordings.plate import Plate
 from surfclass.frames import Capture
-from surfclass.kinematics import forward_kinematics, pose_difference
+from surfclass.geometry import corrected_depth
+from surfclass.kinematics import corrected, flange_pose, pose_difference
 from surfclass.rig import DepthRig
 from surfclass.types import Float64, Transform
 
@@ -35,7 +36,8 @@ _LEAST_VIEWS = 3
 class _Seen:
     """A view with enough discs, and the ways they can lie on the plate."""
 
-    capture: Capture
+    name: str
+    q: Float64
     base_T_flange: Transform
     discs: list[Disc]
     ways: list[Arrangement]
@@ -98,7 +100,8 @@ def _look(capture: Capture, rig: DepthRig, plate: Plate, known: Float64, note: N
     if capture.depth.ir is None:
         note(f"capture {capture.name}: left out, it has no IR image")
         return None
-    sighting = look_for_discs(capture.depth, rig.depth, plate.disc_radius_m)
+    depth_mm = corrected_depth(capture.depth.depth_mm, rig)
+    sighting = look_for_discs(capture.depth, rig.depth, plate.disc_radius_m, depth_mm)
     discs = list(sighting.discs)
     if len(discs) < LEAST_DISCS:
         why = sorted({one.reason for one in sighting.rejected})
@@ -114,8 +117,8 @@ def _look(capture: Capture, rig: DepthRig, plate: Plate, known: Float64, note: N
             f"no {LEAST_DISCS} of them"
         )
         return None
-    pose = forward_kinematics(capture.joints.q, rig.arm.flange_offset_m)
-    return _Seen(capture, pose, discs, ways)
+    q = corrected(capture.joints.q, rig.arm)
+    return _Seen(capture.name, q, flange_pose(capture.joints.q, rig.arm), discs, ways)
 
 
 def _told_apart(seen: list[_Seen]) -> list[Arrangement]:
@@ -211,9 +214,8 @@ def _view(one: _Seen, way: Arrangement, known: Float64, without: set[int]) -> Vi
     target = np.array([point for point, _ in pairs]).reshape(-1, 3)
     discs = [disc for _, disc in pairs]
     pixel_sd = [float(np.sqrt(np.trace(disc.pixel_covariance) / 2)) for disc in discs]
-    joints = one.capture.joints
     return View(
-        name=one.capture.name,
+        name=one.name,
         base_T_flange=one.base_T_flange,
         pixels=Pixels(target, np.array([disc.pixel for disc in discs]).reshape(-1, 2), np.array(pixel_sd)),
         positions=Positions(
@@ -221,5 +223,5 @@ def _view(one: _Seen, way: Arrangement, known: Float64, without: set[int]) -> Vi
             np.array([disc.camera_m for disc in discs]).reshape(-1, 3),
             np.array([disc.depth_sd_m for disc in discs]),
         ),
-        q=None if joints is None else joints.q,
+        q=one.q,
     )

@@ -40,13 +40,16 @@ def find_discs(frame: DepthFrame, camera: Camera, radius_m: float) -> list[Disc]
     return list(look_for_discs(frame, camera, radius_m).discs)
 
 
-def look_for_discs(frame: DepthFrame, camera: Camera, radius_m: float) -> Sighting:
+def look_for_discs(
+    frame: DepthFrame, camera: Camera, radius_m: float, depth_mm: NDArray[Any] | None = None
+) -> Sighting:
     """Finds the reflector discs of known radius in a frame's IR image, and their centres by its depth.
 
     Args:
         frame: With an IR image of the same grid as the depth image.
         camera: The depth camera.
         radius_m: Of every disc.
+        depth_mm: (h, w) what counts instead of the frame's own readings: corrected ones.
 
     Raises:
         InputError: If there is no IR image, a size does not fit, or the radius is not positive.
@@ -55,9 +58,10 @@ def look_for_discs(frame: DepthFrame, camera: Camera, radius_m: float) -> Sighti
         raise InputError("discs: the frame has no IR image; record depth with IR (openni2: ir = true)")
     if not (np.isfinite(radius_m) and radius_m > 0):
         raise InputError(f"discs: radius {radius_m} m, allowed is a length above 0")
-    check_size(frame.depth_mm, camera)
+    readings = frame.depth_mm if depth_mm is None else depth_mm
+    check_size(readings, camera)
     check_size(frame.ir, camera)
-    look = _Look(frame.ir, frame.depth_mm, camera, radius_m)
+    look = _Look(frame.ir, readings, camera, radius_m)
     blobs = find_blobs(frame.ir, *look.radii_px())
     brightness = {id(blob): look.brightness(blob) for blob in blobs}
     found: list[tuple[Disc, Circle]] = []
