@@ -66,7 +66,8 @@ class TerminalUi:
         fresh = situation.judged[self._printed :]
         self._printed = len(situation.judged)
         for one in fresh:
-            self._line(_judged(one, situation))
+            stands = f" ({situation.taken}/{situation.needed})" if one is fresh[-1] else ""
+            self._line(_judged(one, stands))
         if any(one.verdict == "accepted" for one in fresh):
             self._show_shares(situation.coverage)
         if situation.doing in ("done", "ended"):
@@ -129,8 +130,7 @@ def shaded(grid: Sequence[Sequence[float]]) -> list[str]:
     return ["".join(_SHADES[cell] * 2 for cell in row) for row in level]
 
 
-def _judged(one: Judged, situation: Situation) -> str:
+def _judged(one: Judged, stands: str) -> str:
     reasons = escape("; ".join(one.reasons))
-    name = f" {escape(one.name)}" if one.name else ""
-    count = f" ({situation.taken}/{situation.needed})" if one.verdict == "accepted" else ""
-    return f"{one.number:3d} {_MARKS[one.verdict]}{name}{count}" + (f": {reasons}" if reasons else "")
+    name = f" {escape(one.name)}{stands}" if one.name else ""
+    return f"{one.number:3d} {_MARKS[one.verdict]}{name}" + (f": {reasons}" if reasons else "")
