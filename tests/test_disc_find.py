@@ -224,3 +224,30 @@ def test_the_picture_shows_discs_green_and_rejected_blobs_orange():
         assert (red - green)[y - 1 : y + 2, x - 1 : x + 2].max() > 60
     assert ((green - red > 80) & (green > blue)).sum() > 9 * 40
     assert (red - blue > 80)[395:425, 585:635].sum() > 60
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_whatever_the_image_nothing_breaks_and_every_covariance_is_one(seed):
+    rng = np.random.default_rng(seed)
+    width, height = [(80, 60), (160, 120), (320, 240)][seed % 3]
+    camera = CAMERA.model_copy(
+        update={
+            "size": (width, height),
+            "fx": 0.9 * width,
+            "fy": 0.9 * width,
+            "cx": width / 2,
+            "cy": height / 2,
+        }
+    )
+    ir = rng.integers(0, rng.choice([2, 30, 300]), (height, width)).astype(np.uint16)
+    for _ in range(rng.integers(0, 12)):
+        middle, axes = rng.integers(0, [width, height]).tolist(), rng.integers(1, 25, 2).tolist()
+        cv2.ellipse(ir, middle, axes, float(rng.uniform(0, 180)), 0, 360, int(rng.integers(1, 1024)), -1)
+    depth = rng.integers(300, 3000) + rng.normal(0, rng.choice([0, 3, 300]), ir.shape)
+    depth[rng.random(ir.shape) < rng.choice([0, 0.3, 0.95])] = 0
+    frame = DepthFrame(0, 0, None, np.clip(depth, 0, 65535).astype(np.uint16), ir)
+    for disc in find_discs(frame, camera, float(rng.choice([0.005, 0.03, 0.1]))):
+        assert np.linalg.eigvalsh(disc.pixel_covariance).min() > 0
+        assert np.linalg.eigvalsh(disc.camera_covariance).min() > 0
+        assert disc.depth_sd_m > 0
+        assert 0 <= disc.saturated <= 1

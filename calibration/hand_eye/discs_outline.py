@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.hand_eye.discs_plane import InversePlane, tukey
+from calibration.hand_eye.discs_plane import LEAST_SLOPE, InversePlane, tukey
 from calibration.hand_eye.single_pose import plane_basis
 from surfclass.geometry import project, rays
 from surfclass.rig import Camera
@@ -219,7 +219,7 @@ def _solved(
         return "no round outline"
     limit = _TUKEY * scale
     influence, slope = tukey(residual / limit)
-    inverse_hessian = np.linalg.inv((a * slope[:, None]).T @ a + scale**2 * prior)
+    inverse_hessian = np.linalg.inv(max(float(slope.mean()), LEAST_SLOPE) * a.T @ a + scale**2 * prior)
     variance = limit**2 * float((influence**2).sum()) / max(1, int(np.count_nonzero(influence)) - 3)
     variance = max(variance, _LEAST_SCALE_PX**2)
     covariance = (variance * inverse_hessian @ (a.T @ a) @ inverse_hessian)[:2, :2]

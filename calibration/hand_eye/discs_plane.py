@@ -15,6 +15,8 @@ _LEAST_READINGS = 30
 _ROUNDS = 6
 _TUKEY = 4.685
 _BLOCKS = 6  # along each side of the readings; those of one block count as one: they share noise and steps
+LEAST_SLOPE = 0.2
+"""Of the biweight's mean derivative, 0.76 where errors are normal: a few readings can make it anything."""
 _ROUNDING_M = 1e-3 / np.sqrt(12)  # depth images carry whole millimetres
 SATURATED_SHARE = 0.2  # of a disc's pixels, from which on its own readings are not relied on
 _LEAST_SHARE = 0.4  # of a region's pixels that must have a reading
@@ -155,7 +157,7 @@ def _covariance(rows: Float64, readings: Readings, residual: Float64, limit: flo
     below what independent readings would give, nor below `floor` (1/m) for each.
     """
     influence, slope = tukey(residual / limit)
-    inverse_hessian = np.linalg.inv((rows * slope[:, None]).T @ rows)
+    inverse_hessian = np.linalg.inv(max(float(slope.mean()), LEAST_SLOPE) * rows.T @ rows)
     variance = limit**2 * float((influence**2).sum()) / max(1, int(np.count_nonzero(influence)) - 3)
     variance = max(variance, floor**2)
     formal: Float64 = variance * inverse_hessian @ (rows.T @ rows) @ inverse_hessian
