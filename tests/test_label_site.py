@@ -29,6 +29,8 @@ from surfclass.errors import InputError
 
 SCALE = 0.25
 VIEWS = {"whole": ("map", 13), "front": ("map", 0), "left": ("test", 1), "lamp": ("light", 2)}
+PLATE = "disc_radius_m = 0.03\npositions_base_m = [[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]\n"
+BOARD = "columns = 9\nrows = 6\nsquare_m = 0.025\n"
 SQUARE = {"label": 2, "points": [[10, 10], [60, 10], [60, 50], [10, 50.5]]}
 
 
@@ -42,7 +44,13 @@ def cell(tmp_path_factory):
     with (
         SensorPackage(world.clock, *devices) as package,
         RecordingWriter(
-            path, truth.rig(world), truth.classes_toml(), {"robot": "r"}, unix_offset_ns=5
+            path,
+            truth.rig(world),
+            truth.classes_toml(),
+            {"robot": "r"},
+            plate_text=PLATE,
+            board_text=BOARD,
+            unix_offset_ns=5,
         ) as writer,
     ):
         for name, (role, index) in VIEWS.items():
@@ -126,6 +134,7 @@ def test_draw_carry_and_finish_write_a_labelled_recording(cell, tmp_path):
     assert path.read_bytes() == before
     source, result = Recording.open(path), Recording.open(out)
     assert (result.rig_text, result.classes_text) == (source.rig_text, source.classes_text)
+    assert (result.plate_text, result.board_text) == (PLATE, BOARD)
     assert (result.metadata, result.unix_offset_ns) == ({"robot": "r"}, 5)
     captures = {capture.name: capture for capture in result.captures()}
     assert [(name, one.role) for name, one in captures.items()] == [

@@ -21,7 +21,7 @@ from surfclass.frames import Capture, ColourFrame, DepthFrame, JointState
 
 SCALE = 0.5
 PLAN = {"reflector_discs": "hand_eye", "grey_card": "response", "checkerboard": "board"}
-BOARD = Board(columns=9, rows=6, square_m=0.025)
+BOARD = "columns = 9\nrows = 6\nsquare_m = 0.025\n"
 GATES = VerifyGates()
 
 
@@ -31,17 +31,17 @@ def quiet(sentence):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """A recording of discs, card and board at the true rig; and the board's description."""
+    """A recording of discs, card and board at the true rig."""
     folder = tmp_path_factory.mktemp("verify")
     path = folder / "fresh.mcap"
     worlds = {scene: SimWorld(scene, seed=2, scale=SCALE) for scene in PLAN}
     rig, plate = truth.rig(worlds["grey_card"]), truth.plate_toml(worlds["reflector_discs"])
-    with RecordingWriter(path, rig, truth.classes_toml(), plate_text=plate) as writer:
+    with RecordingWriter(path, rig, truth.classes_toml(), plate_text=plate, board_text=BOARD) as writer:
         for scene, role in PLAN.items():
             world = worlds[scene]
             for number, view in enumerate(chosen(world, scene)):
                 writer.write(seen(world, role, number, view.q))
-    return path, BOARD
+    return path
 
 
 def chosen(world, scene):
@@ -64,9 +64,9 @@ def seen(world, role, number, q):
 
 
 def checked(site, values=None, note=quiet, **options):
-    source = Source.open(site[0])
+    source = Source.open(site)
     source = source if values is None else source.with_values(values)
-    return verify(source, VerifyOptions(board=site[1], **options), GATES, note)
+    return verify(source, VerifyOptions(**options), GATES, note)
 
 
 def verdicts(outcome):
@@ -75,7 +75,7 @@ def verdicts(outcome):
 
 def moved(site, table, key, by):
     """The rig's value with some numbers added; of a transform to its translation."""
-    rig = Source.open(site[0]).rig
+    rig = Source.open(site).rig
     value = np.array(getattr(getattr(rig, table), key), np.float64)
     if value.ndim == 2:
         value[:3, 3] += by
@@ -113,7 +113,7 @@ def test_what_is_wrong_is_named_and_nothing_else(site, table, key, by, failing, 
 
 
 def test_a_plate_that_was_moved_is_not_taken_for_a_wrong_hand_eye(site):
-    source = Source.open(site[0])
+    source = Source.open(site)
     plate = source.plate.model_copy(
         update={"positions_base_m": tuple((x, y + 0.006, z) for x, y, z in source.plate.positions_base_m)}
     )
@@ -122,39 +122,38 @@ def test_a_plate_that_was_moved_is_not_taken_for_a_wrong_hand_eye(site):
     assert "the plate was moved" in outcome.reasons[0]
 
 
-def test_what_cannot_be_checked_is_said_with_the_reason_and_the_rest_is(site):
+def test_what_cannot_be_checked_is_said_with_the_reason_and_the_rest_is(site, tmp_path):
     outcome = checked(site, {"light": None})
     told = outcome.result["parts"]
     assert "calibrate light first" in told["grey_card"]["not_checked"]
     assert "no labelled capture" in told["boards"]["not_checked"]
     assert outcome.verdict == "pass"
-    outcome = verify(Source.open(site[0]), VerifyOptions(require=("cameras", "boards")), GATES, quiet)
+    boardless = rewritten(site, tmp_path, lambda one: one, ("board", "response"), board=None)
+    outcome = checked(boardless, require=("cameras", "boards"))
     assert "board.toml" in outcome.result["parts"]["cameras"]["not_checked"]
     assert outcome.verdict == "fail"
     assert len(outcome.reasons) == 2
 
 
 def test_a_rig_without_hand_eye_or_response_says_which_calibration_is_missing(site):
-    source = Source.open(site[0])
-    bare = dataclasses.replace(source, rig=source.rig.with_values({"response": None}))
-    told = verify(bare, VerifyOptions(), GATES, quiet).result["parts"]
-    assert "response.inverse" in told["grey_card"]["not_checked"]
+    source = Source.open(site)
     transforms = source.rig.transforms.model_copy(update={"flange_T_depth": None})
-    bare = dataclasses.replace(source, rig=source.rig.model_copy(update={"transforms": transforms}))
-    told = verify(bare, VerifyOptions(), GATES, quiet).result["parts"]
+    bare = source.rig.model_copy(update={"transforms": transforms, "response": None})
+    told = verify(dataclasses.replace(source, rig=bare), VerifyOptions(), GATES, quiet).result["parts"]
+    assert "response.inverse" in told["grey_card"]["not_checked"]
     assert "calibrate hand-eye first" in told["discs"]["not_checked"]
 
 
-def rewritten(site, tmp_path, change, roles=None):
-    """The recording with some captures changed, or without those that `change` makes None."""
-    recording = Recording.open(site[0])
+def rewritten(site, tmp_path, change, roles, board=BOARD):
+    """The recording's captures of some roles, each changed."""
+    recording = Recording.open(site)
     path = tmp_path / "changed.mcap"
-    with RecordingWriter(path, recording.rig_text, None, plate_text=recording.plate_text) as writer:
+    with RecordingWriter(
+        path, recording.rig_text, None, plate_text=recording.plate_text, board_text=board
+    ) as writer:
         for capture in recording.captures(roles):
-            other = change(capture)
-            if other is not None:
-                writer.write(other)
-    return path, site[1]
+            writer.write(change(capture))
+    return path
 
 
 def test_nothing_to_check_is_refused_with_every_reason(site, tmp_path):
@@ -180,7 +179,7 @@ def test_an_overexposed_card_is_left_out_with_a_note_and_does_not_decide(site, t
 
 
 def test_a_wrong_board_or_a_blind_image_leaves_the_cameras_unchecked(site, tmp_path):
-    outcome = checked((site[0], BOARD.model_copy(update={"square_m": 0.030})))
+    outcome = checked(site, board=Board(columns=9, rows=6, square_m=0.030))
     assert "the board's squares have another size" in outcome.reasons[0] or "depth" in outcome.reasons[0]
     blind = rewritten(
         site,

@@ -143,8 +143,8 @@ class LabelSession:
     def finish(self) -> int:
         """Writes the labelled recording, whole or not at all, and returns how many captures have labels.
 
-        It has every capture of the recording, in order, with rig, classes and plate; map updates, which
-        the labels are to judge, stay behind. What is drawn stays on the disk too.
+        It has every capture of the recording, in order, with rig, classes, plate and board; map updates,
+        which the labels are to judge, stay behind. What is drawn stays on the disk too.
 
         Raises:
             InputError: If a view is to be for training or testing and has no labels.
@@ -175,6 +175,7 @@ class LabelSession:
             self.classes_text,
             recording.metadata,
             plate_text=recording.plate_text,
+            board_text=recording.board_text,
             unix_offset_ns=recording.unix_offset_ns,
         )
         try:

@@ -24,7 +24,7 @@ class VerifyOptions:
 
     Attributes:
         model: The model that labelled captures are classified with; None leaves them out.
-        board: What `board` captures look at; None leaves them out.
+        board: What `board` captures look at; None: what the recording says.
         require: Parts that have to be checked, out of PARTS: one that cannot be is a failure. What else
             the captures allow is checked too.
     """
@@ -43,7 +43,7 @@ def verify(source: Source, options: VerifyOptions, gates: VerifyGates, note: Not
 
     | role | what is checked |
     | --- | --- |
-    | `board` | both cameras, what is between them, depth |
+    | `board`, with board.toml | both cameras, what is between them, depth |
     | `hand_eye`, with plate.toml | hand-eye, arm and depth: discs in the base frame |
     | `response` | light, response and vignetting: K_d of a grey card |
     | `test`, `train`, with a model | the whole method: labelled pixels |
@@ -58,7 +58,7 @@ def verify(source: Source, options: VerifyOptions, gates: VerifyGates, note: Not
         RefusedError: If nothing at all can be checked.
     """
     checks: dict[str, Callable[[], Part]] = {
-        cameras.KEY: lambda: cameras.check_cameras(source, options.board, gates, note),
+        cameras.KEY: lambda: cameras.check_cameras(source, options.board or source.board, gates, note),
         discs.KEY: lambda: discs.check_discs(source, gates, note),
         card.KEY: lambda: card.check_card(source, gates, note),
         boards.KEY: lambda: boards.check_boards(source, options.model, gates, note),
