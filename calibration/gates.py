@@ -10,9 +10,28 @@ from surfclass.schema import Number, Positive, Table
 
 
 class CamerasGates(Table):
-    """Of `calibrate cameras`."""
+    """Of `calibrate cameras`.
+
+    Attributes:
+        rms_px: Root mean square of the corners' distances in each camera.
+        held_out_px: Root mean square over the views, each with cameras found without it.
+        projection_px: Standard deviation of where a point projects, at its worst in the central 80 % of
+            the image of the first camera or the second.
+        translation_sd_m: Of one camera in the other's frame, along its worst axis.
+        rotation_sd_rad: Likewise, about its worst axis.
+        coverage: Share of the image's 5 × 4 parts in which corners were seen.
+        outlier_views: So many views may not fit and be left out.
+        depth_rms: Relative, of the depth readings on boards that were held out, corrected.
+    """
 
     rms_px: Positive = 0.5
+    held_out_px: Positive = 0.7
+    projection_px: Positive = 1.5
+    translation_sd_m: Positive = 0.002
+    rotation_sd_rad: Positive = 0.003
+    coverage: Annotated[Number, Field(ge=0, le=1)] = 0.5
+    outlier_views: Annotated[int, Field(ge=0)] = 2
+    depth_rms: Positive = 0.01
 
 
 class HandEyeGates(Table):

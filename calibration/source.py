@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.recordings import Recording
+from drivers.recordings.board import Board
 from drivers.recordings.folder import FolderSet, read_folder
 from drivers.recordings.plate import Plate
 from surfclass.errors import InputError
@@ -81,6 +82,12 @@ class Source:
         found = self._set.metadata.items()
         return {key.removeprefix(SERIAL): value for key, value in found if key.startswith(SERIAL)}
 
+    @property
+    def board(self) -> Board | None:
+        """The calibration board that the captures look at, or None."""
+        own = self._set.board
+        return own or next((other.board for other in self._more if other.board), None)
+
     def count(self, role: str) -> int:
         """Returns how many captures have this role."""
         if isinstance(self._set, FolderSet):
@@ -90,9 +97,10 @@ class Source:
         return own + sum(other.count(role) for other in self._more)
 
     def digests(self) -> dict[str, str]:
-        """Returns the sha256 of every file that the captures came from, by its path."""
+        """Returns the sha256 of every file that the captures came from, by its name from their folder on."""
         files = sorted(path for path in self.path.rglob("*") if path.is_file()) if self.path.is_dir() else []
-        found = {str(path): sha256(path) for path in files or [self.path]}
+        folder = self.path.resolve().parent
+        found = {str(path.resolve().relative_to(folder)): sha256(path) for path in files or [self.path]}
         return found | {name: digest for other in self._more for name, digest in other.digests().items()}
 
 

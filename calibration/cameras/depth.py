@@ -142,6 +142,12 @@ def fit_depth(readings: Sequence[DepthReadings]) -> DepthFit:
     )
 
 
+def corrected_error(one: DepthReadings, correction: DepthCorrection) -> Float64:
+    """Returns (n,) the corrected readings over the plane's depth, minus 1."""
+    x = np.array([*correction.multiplier, correction.inverse_offset_per_m])
+    return np.asarray(1 / (_relative(one, x, len(correction.multiplier)) + 1) - 1)
+
+
 def _relative(one: DepthReadings, x: Float64, count: int) -> Float64:
     """(n,) the plane's depth over the corrected reading, minus 1."""
     multiplier = np.tensordot(x[:count], multiplier_terms(one.place[:, 0], one.place[:, 1], count), axes=1)

@@ -10,7 +10,7 @@ import numpy as np
 from surfclass.types import Float32, Float64
 
 _REACH = 0.85  # of a square: how far from its corner the pattern is compared; beyond 1 the next edges come
-_MOST_STEPS = 15  # from a corner to the end of its reach, a pixel each where that is enough
+_MOST_STEPS = 12  # from a corner to the end of its reach, a pixel each where that is enough
 _BLURS_PX = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # an edge's standard deviations that are tried
 _ROUNDS = 8
 _SETTLED_PX = 1e-3
@@ -41,9 +41,12 @@ def refine(grey: Float32, rough: Float64, size: tuple[int, int]) -> Float64:
     side = np.minimum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
     widest = max(float(np.median(side)) / 5, _BLURS_PX[0])
     corners, fits = start, []
-    for blur in reversed([blur for blur in _BLURS_PX if blur <= widest]):
-        corners, misfit = _fit(grey, corners, along, down, blur, noise)  # the widest reaches farthest
+    blurs = [blur for blur in _BLURS_PX if blur <= widest]
+    for blur in (blurs[-1], *blurs):  # the widest reaches farthest; from there on, the narrowest first
+        corners, misfit = _fit(grey, corners, along, down, blur, noise)
         fits.append((misfit, corners))
+        if len(fits) > 3 and fits[-1][0] > fits[-2][0]:
+            break  # wider ones fit worse and worse
     best = min(fits, key=lambda fit: fit[0])[1]
     away = np.linalg.norm(best - start, axis=1)
     return np.where((away < _MOST_SHIFT * side)[:, None], best, np.nan)

@@ -17,9 +17,10 @@ from surfclass.types import Bool, Float64
 
 ORDERS = (0, 1, 2, 4, 5)
 _OUTLIER = 6.0  # standard deviations: one corner in 10⁷ of a Gaussian
-_OUTLYING_VIEW = 3.0  # times the median view's rms
+_OUTLYING_VIEW = 4.0  # times the median view's median residual, each camera's by its noise
 _LEAST_OUTLIER_PX = 0.3
 _SIGNIFICANT = 2.5  # standard deviations, by leaving out views
+_SMALLEST = 2  # no lens is without k1 and k2, and a small one that is left out bends the focal length
 _LEAST_VIEWS = 5  # to tell significance from
 
 
@@ -89,15 +90,15 @@ def chosen_order(observations: Observations, start: State) -> int:
         start: Near enough, with at most k1 and k2.
     """
     if len(observations.views) < _LEAST_VIEWS:
-        return 1
+        return _SMALLEST
     state = start
-    for order, below in zip(ORDERS[:0:-1], ORDERS[-2::-1], strict=True):
+    for order, below in ((5, 4), (4, _SMALLEST)):
         fit = adjust(observations, _within(state, order), free_parameters(order)[None])
         sd = np.sqrt(np.maximum(np.diag(jackknife(fit)), np.diag(fit.covariance)))
         if (np.abs(fit.shared()[4 + below :]) > _SIGNIFICANT * sd[4 + below :]).any():
             return order
         state = fit.state
-    return 0
+    return _SMALLEST
 
 
 def _within(state: State, order: int) -> State:
@@ -109,13 +110,14 @@ def _cleaned(observations: Observations, start: State, free: Bool, orders: tuple
     """Adjusts, leaves out views and then corners that do not fit, and adjusts the rest."""
     fit = adjust(observations, start, free)
     views: dict[str, float] = {}
+    noise = corner_noise(observations, fit.residual)
     square = (fit.residual**2).sum(axis=1)
-    rms = np.array(
-        [np.sqrt(np.median(square[observations.view == i]) / np.log(2)) for i in range(len(start.poses))]
-    )
+    away = square / noise[observations.camera] ** 2
+    own = [observations.view == i for i in range(len(start.poses))]
+    rms = np.array([np.sqrt(np.median(away[of])) for of in own])
     bad = rms > _OUTLYING_VIEW * np.median(rms)
     if bad.any() and (~bad).sum() >= 3:
-        views = {observations.views[i]: float(rms[i]) for i in np.flatnonzero(bad)}
+        views = {observations.views[i]: float(np.sqrt(square[own[i]].mean())) for i in np.flatnonzero(bad)}
         kept = np.flatnonzero(~bad)
         observations = observations.of_views(kept.tolist())
         fit = adjust(
