@@ -277,8 +277,7 @@ def _reasons(estimate: LightEstimate, variation: Variation, gates: LightGates) -
         reasons.append(
             f"the light's position is uncertain by {1e3 * estimate.position_sd:.1f} mm, allowed are "
             f"{1e3 * gates.position_sd_m:g} mm; add boards that are turned differently, or a grey card at "
-            "more "
-            "distances"
+            "more distances"
         )
     if variation.full is not None and variation.full > gates.k_d_variation:
         worst = max(variation.views, key=lambda name: variation.views[name])

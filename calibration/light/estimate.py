@@ -84,8 +84,8 @@ def board_views(source: Source, rig: Rig, inverse: Float64, use: Use, note: Note
         roles = " or ".join(f"'{role}'" for role in ROLES[use])
         raise RefusedError(
             f"there is no capture of role {roles}; take {LEAST_BOARDS + 1} or more of a semi-gloss board "
-            "(role "
-            "'light'), turned differently, and some of a grey card at several distances (role 'response')"
+            "(role 'light'), turned differently, and some of a grey card at several distances (role "
+            "'response')"
         )
     note(f"read {len(views)} views of boards")
     return views
@@ -102,8 +102,7 @@ def estimate_light(views: Sequence[BoardSamples], known: PositionPrior | None = 
     if not near_light.shines_everywhere(found.parameters, found.observed).all():
         raise RefusedError(
             "the fit puts the light where it does not shine on the boards: the depth image and the colour "
-            "image do "
-            "not belong together, or something else lights the boards"
+            "image do not belong together, or something else lights the boards"
         )
     rows = fit.leave_out(found)
     covariance = fit.covariance(found, rows)
@@ -118,9 +117,9 @@ def estimate_light(views: Sequence[BoardSamples], known: PositionPrior | None = 
     )
     if known is None and estimate.position_sd > _UNDETERMINED_M:
         raise RefusedError(
-            f"the views leave the light's position open by {1e3 * estimate.position_sd:.0f} mm; take boards "
-            "that are "
-            "turned differently (by 10° about both image axes), or a grey card at distances from 0.6 to 1.3 m"
+            f"the views leave the light's position open by {1e3 * estimate.position_sd:.0f} mm; take "
+            "boards that are turned differently (by 10° about both image axes), or a grey card at "
+            "distances from 0.6 to 1.3 m"
         )
     return estimate
 
@@ -164,9 +163,9 @@ def _usable(views: Sequence[BoardSamples]) -> tuple[list[BoardSamples], tuple[st
     if len(boards) < LEAST_BOARDS and (len(cards) < LEAST_DISTANCES or spread < _LEAST_DISTANCE_RATIO):
         reason = (
             f"{len(boards)} boards and {len(cards)} views of a grey card (farthest over nearest: "
-            f"{spread:.2f}) do not "
-            f"determine the light; needed are {LEAST_BOARDS} differently turned boards, or a grey card at "
-            f"{LEAST_DISTANCES} distances that differ by {_LEAST_DISTANCE_RATIO - 1:.0%} and more"
+            f"{spread:.2f}) do not determine the light; needed are {LEAST_BOARDS} differently turned "
+            f"boards, or a grey card at {LEAST_DISTANCES} distances that differ by "
+            f"{_LEAST_DISTANCE_RATIO - 1:.0%} and more"
         )
         raise RefusedError(f"{reason}; {exposure}" if exposure else reason)
     told = tuple(too_bright([view]) or f"{view.name} shows too little of the board" for view in bad)

@@ -18,7 +18,7 @@ _MODEL_ERROR = 0.001  # of the irradiance: no board is quite even, no curve quit
 LOBE_ERROR = (
     0.05  # of the specular part: no lobe has quite this shape, so near the highlight all counts little
 )
-_UNEVEN = 0.0002  # of the irradiance: what is smooth over a view and not known, at the least
+_UNEVEN = 0.0001  # of the irradiance: what is smooth over a view and not known, at the least
 _START_ERROR = 0.02  # of the irradiance, while the lobe is not known
 _TIGHTNESS = (300.0, 10.0, 1.0)  # of what is thought beforehand: first only position and lobes move
 _WEAK = np.array([0.5, 0.5, 0.5, 0.3, 0.3, 2.0, 5.0, 20.0, 60.0, 0.5])

@@ -161,8 +161,7 @@ def _highlight_faults(highlight: Bool, matte: Bool, board: Bool) -> list[str]:
     if share < _LEAST_MATTE:
         reasons.append(
             f"only {share:.0%} of the board is matte, needed are {_LEAST_MATTE:.0%}: go nearer, or use a "
-            "less glossy "
-            "board"
+            "less glossy board"
         )
     return reasons
 

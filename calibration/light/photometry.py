@@ -72,22 +72,19 @@ def known_response(source: Source, rig: Rig, note: Note) -> tuple[Float64, dict[
         found = response_of(source.captures("exposure"))
         note(
             f"the rig has no response: found it from the exposure series, to {100 * found.curve_sd:.2f} %, "
-            "a left-out "
-            f"exposure predicted to {100 * found.held_out_rms:.3f} % of full scale"
+            f"a left-out exposure predicted to {100 * found.held_out_rms:.3f} % of full scale"
         )
         return found.inverse, {"inverse": found.inverse.tolist()}
     if source.count("response"):
         weak = response_from_distances(source)
         note(
             "the rig has no response and there is no exposure series: found it from the grey card's "
-            "distances, to "
-            f"{100 * weak.curve_sd:.1f} % only"
+            f"distances, to {100 * weak.curve_sd:.1f} % only"
         )
         return weak.inverse, {"inverse": weak.inverse.tolist()}
     raise RefusedError(
         "response.inverse is missing in the rig, and there are captures neither of role 'exposure' nor of "
-        "role "
-        "'response' to find it from; run `surfclass calibrate response` first"
+        "role 'response' to find it from; run `surfclass calibrate response` first"
     )
 
 

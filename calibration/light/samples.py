@@ -113,8 +113,7 @@ def board_plane(capture: Capture, rig: Rig) -> Plane:
     if share < _LEAST_PLANE_SHARE:
         raise InputError(
             f"capture {capture.name}: only {share:.0%} of the depth readings lie on one plane; the board "
-            "must "
-            "be flat and fill most of the image"
+            "must be flat and fill most of the image"
         )
     thickness = float(np.std(chosen[near] @ normal - offset))
     turned = rig.rgb_T_depth.rotation @ normal

@@ -10,7 +10,7 @@ from surfclass.errors import InputError
 from surfclass.types import Bool, Float32, Float64
 
 _ROUNDS = 8
-_STEP = 8  # of the pixels that the background is fitted to
+_STEP = 4  # of the pixels that the background is fitted to
 _LEAST_EXCESS = 0.10  # a highlight outshines the diffuse background by so much of it
 _BAND = (0.5, 3.0)  # allowed widths of the guard band, radii of the highlight
 
@@ -36,9 +36,8 @@ def thresholds(intensity: Float32, usable: Bool) -> LightSearch:
     if peak < _LEAST_EXCESS:
         raise InputError(
             f"light: nothing on the board is brighter than its surroundings by more than {peak:.0%}, so "
-            "there is "
-            "no highlight; the board must be semi-gloss, and turned so that it mirrors the light into the "
-            "camera"
+            "there is no highlight; the board must be semi-gloss, and turned so that it mirrors the light "
+            "into the camera"
         )
     noise = 1.4826 * float(np.median(np.abs(smooth[usable & (smooth < _LEAST_EXCESS)])))
     shines = usable & (smooth > max(0.02, 4 * noise))
@@ -53,19 +52,24 @@ def thresholds(intensity: Float32, usable: Bool) -> LightSearch:
 
 
 def diffuse_background(intensity: Float32, usable: Bool) -> Float64:
-    """Returns (h, w): a quadratic surface through what is not brighter than it, by repeated least squares."""
+    """Returns (h, w): a smooth surface through what is not brighter than it, by repeated least squares.
+
+    Its logarithm is of second order, with r⁴ for the lens.
+    """
     h, w = intensity.shape
     y, x = np.mgrid[:h, :w].astype(np.float64)
     x, y = 2 * x / w - 1, 2 * y / h - 1
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    r2 = x * x + y * y
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, r2 * r2], axis=-1)
     part = np.s_[::_STEP, ::_STEP]
-    rows, values, seen = terms[part].reshape(-1, 6), intensity[part].ravel(), usable[part].ravel()
-    kept = seen & (values <= np.quantile(values[seen], 0.8)) if seen.any() else seen
+    rows, seen = terms[part].reshape(-1, terms.shape[-1]), usable[part].ravel()
+    values = np.log(np.maximum(intensity[part].ravel().astype(np.float64), 1e-3))
+    kept = seen & (values <= np.quantile(values[seen], 0.85)) if seen.any() else seen
     if kept.sum() < 20:
         raise InputError("light: the board covers too little of the image")
     for _ in range(_ROUNDS):
-        found = np.linalg.lstsq(rows[kept], values[kept].astype(np.float64), rcond=None)[0]
+        found = np.linalg.lstsq(rows[kept], values[kept], rcond=None)[0]
         away = values - rows @ found
-        spread = 1.4826 * float(np.median(np.abs(away[kept]))) + 1e-4
-        kept = seen & (away < 2.5 * spread)
-    return np.asarray(terms @ found)
+        spread = 1.4826 * float(np.median(np.abs(away[kept]))) + 1e-3
+        kept = seen & (away < 3 * spread)
+    return np.asarray(np.exp(terms @ found))

@@ -47,9 +47,8 @@ def calibrate(source: Source, options: ResponseOptions, gates: ResponseGates, no
         used = "exposure" if exposures else "distance"
     if used == "exposure" and not exposures:
         raise RefusedError(
-            "there is no capture of role 'exposure'; take one pose of the grey card at 5 or more exposures, "
-            "each "
-            "about twice the one before"
+            "there is no capture of role 'exposure'; take one pose of the grey card at 5 or more "
+            "exposures, each about twice the one before"
         )
     polynomial, why_not = _polynomial(source)
     if options.thesis:
@@ -83,9 +82,8 @@ def _thesis(polynomial: Float64 | None, why_not: str) -> Outcome:
         "response",
         "pass",
         (),
-        f"polynomial of Eq. 4.4, green: {rows[1][0]:.3f} d² {rows[1][1]:+.3f} d {rows[1][2]:+.3f}; it holds "
-        "straight "
-        "on and at this exposure only",
+        f"polynomial of Eq. 4.4, green: {rows[1][0]:.3f} d² {rows[1][1]:+.3f} d {rows[1][2]:+.3f}; it "
+        "holds straight on and at this exposure only",
         result,
         {"response": {"a2_a1_a0": rows}},
     )
@@ -141,10 +139,9 @@ def _from_exposures(found: ExposureResponse, gates: ResponseGates) -> Outcome:
     linear = all(curve.bend is None for curve in found.curves)
     sentence = (
         f"{'linear camera' if linear else 'response'} from "
-        f"{sum(e is not None for e in found.held_out.values())} "
-        f"exposures: a left-out one is predicted to {100 * found.held_out_rms:.3f} % of full scale, g⁻¹ "
-        "known to "
-        f"{100 * found.curve_sd:.2f} % between intensities {low:.2f} and {high:.2f}"
+        f"{sum(e is not None for e in found.held_out.values())} exposures: a left-out one is predicted to "
+        f"{100 * found.held_out_rms:.3f} % of full scale, g⁻¹ known to {100 * found.curve_sd:.2f} % "
+        f"between intensities {low:.2f} and {high:.2f}"
     )
     rows = [
         [
@@ -203,10 +200,10 @@ def _from_distances(found: DistanceResponse, gates: ResponseGates) -> Outcome:
         "position_rgb_m": found.position.tolist(),
     }
     sentence = (
-        f"response from {len(found.held_out)} views of the grey card, together with the light: g⁻¹ known to "
-        f"{100 * found.curve_sd:.1f} % between intensities {low:.2f} and {high:.2f}, a left-out view "
-        "predicted to "
-        f"{100 * found.held_out_rms:.2f} % of full scale; an exposure series is several times better"
+        f"response from {len(found.held_out)} views of the grey card, together with the light: g⁻¹ known "
+        f"to {100 * found.curve_sd:.1f} % between intensities {low:.2f} and {high:.2f}, a left-out view "
+        f"predicted to {100 * found.held_out_rms:.2f} % of full scale; an exposure series is several times "
+        "better"
     )
     rig: Mapping[str, Any] = {"response": {"inverse": result["inverse"]}}
     return Outcome(
@@ -231,13 +228,11 @@ def _reasons(held_out: float, curve_sd: float, reach: float, gates: ResponseGate
     if not curve_sd <= gates.curve_sd:
         reasons.append(
             f"g⁻¹ is uncertain by {100 * curve_sd:.2f} % (jackknife), allowed are {100 * gates.curve_sd:g} "
-            "%; take more "
-            "exposures"
+            "%; take more exposures"
         )
     if reach < gates.least_range:
         reasons.append(
             f"only {reach:.0%} of the intensities were seen, needed are {gates.least_range:.0%}; take "
-            "longer and shorter "
-            "exposures"
+            "longer and shorter exposures"
         )
     return tuple(reasons)

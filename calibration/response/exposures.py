@@ -133,8 +133,7 @@ def _residuals(series: Series, found: list[ResponseCurve]) -> tuple[float, dict[
     if number == 0:
         raise RefusedError(
             "exposure series: no part of the scene is well exposed in two exposures; take them closer "
-            "together, "
-            "each about twice the one before"
+            "together, each about twice the one before"
         )
     _must_agree(series, misfits)
     errors = {

@@ -57,8 +57,7 @@ class ResponseGuide:
         if not self._taken:
             return (
                 "put the grey card before the camera so that it fills the image, touch nothing from then "
-                "on, and "
-                "take it at an exposure at which its middle has about half of full scale"
+                "on, and take it at an exposure at which its middle has about half of full scale"
             )
         wanted_s = 2 * max(self._taken)
         if not self._seen[:2].any():

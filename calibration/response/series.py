@@ -22,7 +22,7 @@ USABLE_SHARE = 0.05
 """An exposure is of use from this share of well exposed places on."""
 
 _ROWS = 30  # of places in an image
-_MOST_PLACES = 500
+_MOST_PLACES = 400
 _ABOVE_NOISE = 4.0  # a place is not lost in the dark from so many standard deviations of a pixel on
 _QUANTISED_SD = 0.05  # least sd of a place's mean, in steps of the converter
 _LEAST_CHANGE = 0.05  # of ln intensity for each ln exposure: less, and the camera has made up for it
@@ -126,8 +126,7 @@ def read_series(captures: Iterable[Capture]) -> Series:
     if unknown:
         raise RefusedError(
             f"exposure series: the exposure time of {', '.join(unknown)} is not known; give every capture "
-            "its "
-            "exposure_s"
+            "its exposure_s"
         )
     if len({_exposure(capture) for capture in taken}) < LEAST_EXPOSURES:
         raise RefusedError(
@@ -215,8 +214,7 @@ def _must_change(level: Float64, use: Bool, times: Float64, names: Sequence[str]
     if still:
         raise RefusedError(
             f"exposure series: the image does not become brighter between {', '.join(still)}; turn the "
-            "camera's "
-            "automatic exposure and gain off, and check the exposure times"
+            "camera's automatic exposure and gain off, and check the exposure times"
         )
 
 
@@ -234,8 +232,7 @@ def _must_not_move(captures: Sequence[Capture]) -> None:
     if moved:
         raise RefusedError(
             f"exposure series: the target or the camera moved between {reference.name} and "
-            f"{', '.join(moved)}; "
-            "take all exposures of one pose, with nothing touched in between"
+            f"{', '.join(moved)}; take all exposures of one pose, with nothing touched in between"
         )
 
 
