@@ -36,7 +36,7 @@ class Options:
     Attributes:
         observations: A file of observations instead of captures.
         target: What the captures look at.
-        board: The board, for "checkerboard" and "charuco".
+        board: The board, for "checkerboard" and "charuco"; None: the captures' own.
         eye: Which camera looks at a board; None: the colour camera where its place is known, else IR.
         joint_offsets: Whether to find the joints' offsets that can be seen.
         flange_offset: Whether to find the last D-H length.
@@ -102,7 +102,7 @@ def _observed(source: Source, options: Options, note: Note) -> tuple[Observation
             )
         captures = _with_joints(list(source.captures("hand_eye")), "hand_eye")
         return observe(captures, source.rig, source.plate, note), "depth"
-    board = options.board
+    board = options.board or source.board
     if board is None:
         raise RefusedError(f"which {options.target}? say its inner corners and the side of its squares")
     if board.kind != options.target:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.boards import find_board
 from calibration.guide import Look
-from calibration.hand_eye.boards_seen import Eye, image_of
+from calibration.hand_eye.boards_seen import Eye, eye_of, image_of
 from calibration.hand_eye.discs_find import look_for_discs
 from calibration.hand_eye.observability import axis_spread, motion_faults
 from calibration.rotations import rotation_vector
@@ -64,15 +64,18 @@ class HandEyeGuide:
     Args:
         rig: The cameras and the arm.
         target: The plate of reflector discs or the board to look at.
-        eye: Which camera looks at a board; the discs shine in the IR camera alone.
+        eye: Which camera looks at a board; None: the colour camera where its place is known, else IR. The
+            discs shine in the IR camera alone.
         views: How many are wanted.
     """
 
-    def __init__(self, rig: DepthRig, target: Plate | Board, eye: Eye = "depth", views: int = VIEWS) -> None:
+    def __init__(
+        self, rig: DepthRig, target: Plate | Board, eye: Eye | None = None, views: int = VIEWS
+    ) -> None:
         self.role = "hand_eye" if isinstance(target, Plate) else "board"
         self._rig = rig
         self._target = target
-        self._eye: Eye = "depth" if isinstance(target, Plate) else eye
+        self._eye: Eye | None = "depth" if isinstance(target, Plate) else eye
         self._views = views
         self._poses: list[Float64] = []
         self._grid = np.zeros((_ROWS, _COLUMNS), np.int64)
@@ -90,10 +93,11 @@ class HandEyeGuide:
 
     def look(self, capture: Capture) -> Look:
         """Judges a view; one that is accepted is remembered."""
-        image = image_of(capture, self._eye)
+        eye = self._eye or eye_of(self._rig, capture.colour is not None)[0]
+        image = image_of(capture, eye)
         if image is None:
             black = np.zeros((*capture.depth.depth_mm.shape, 3), np.uint8)
-            what = "IR" if self._eye == "depth" else "colour"
+            what = "IR" if eye == "depth" else "colour"
             return Look(False, (f"there is no {what} image; switch it on in the configuration",), black)
         grey = _grey(image)
         found = self._found(capture, image)

@@ -89,9 +89,7 @@ def outlier_sentences(solution: Solution, seen: Observations) -> list[str]:
         if left is not None:
             turn, shift = (float(np.linalg.norm(left.deviation[place][part])) for part in (_TURN, _SHIFT))
             how = f": its arm pose is {1e3 * shift:.2f} mm and {np.degrees(turn):.3f}° off by the other poses"
-        sentences.append(
-            (number, f"pose {number} ({seen.views[number].name}) does not fit and is left out{how}")
-        )
+        sentences.append((number, f"pose {_called(number, seen)} does not fit and is left out{how}"))
     return [sentence for _, sentence in sorted(sentences)]
 
 
@@ -199,6 +197,12 @@ def target_pose(solution: Solution) -> Float64:
     return align(problem.target, placed, "fixed", "target").matrix
 
 
+def _called(number: int, seen: Observations) -> str:
+    """A pose by its place in the file, and by its name where it has one."""
+    name = seen.views[number].name
+    return f"{number}" if name == f"{number}" else f"{number} ({name})"
+
+
 def _split(sd: Float64) -> dict[str, list[float]]:
     return {"translation_m": sd[_SHIFT].tolist(), "rotation_rad": sd[_TURN].tolist()}
 
@@ -297,7 +301,8 @@ def _pose_row(pose: Mapping[str, Any]) -> Sequence[str]:
     off = ("–", "–")
     if "arm_off_m" in pose:
         off = (f"{1e3 * pose['arm_off_m']:.2f}", f"{np.degrees(pose['arm_off_rad']):.3f}")
-    return f"{pose['index']} {pose['name']}", "yes" if pose["used"] else "no", *fitted, *left, *off
+    called = f"{pose['index']}" if pose["name"] == str(pose["index"]) else f"{pose['index']} ({pose['name']})"
+    return called, "yes" if pose["used"] else "no", *fitted, *left, *off
 
 
 def _two(figures: tuple[float | None, float | None]) -> tuple[str, str]:
