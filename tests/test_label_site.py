@@ -255,6 +255,23 @@ def test_a_capture_for_training_without_labels_is_named_and_nothing_is_written(c
         assert page.post("/finish", {})["labelled"] == 2
 
 
+def test_a_full_disk_is_told_on_the_page_and_what_was_saved_stays(cell, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    out = tmp_path / "out.mcap"
+    with labelling(cell[0], out) as (page, _):
+        page.draw(0, SQUARE)
+        before = state_path(out).read_bytes()
+        monkeypatch.setattr("calibration.label.session.save_state", full)
+        assert "No space left" in page.draw(0, SQUARE, SQUARE, status=507)["error"]
+        monkeypatch.setattr("calibration.label.session.RecordingWriter", full)
+        assert "No space left" in page.post("/finish", {}, 507)["error"]
+        assert len(page.session()["views"][0]["shapes"]) == 1
+    assert state_path(out).read_bytes() == before
+    assert not out.exists()
+
+
 def test_a_suggestion_keeps_what_was_recorded_and_is_nothing_where_nobody_says_anything(cell, tmp_path):
     session = LabelSession(cell[0], tmp_path / "out.mcap")
     assert session.suggest(2, [0, 1]) == ()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from http import HTTPStatus
 from importlib.resources import files
 from typing import Annotated, Any
@@ -56,8 +57,10 @@ def routes(session: LabelSession, finished: Callable[[int], None]) -> Mapping[tu
         return Reply(overlay_png(session.view(_index(request)).below, session.classes), "image/png")
 
     def draw(request: Request) -> Reply:
+        index, drawn = _index(request), validate(ViewState, _object(request), "drawing")
         try:
-            kept = session.draw(_index(request), validate(ViewState, _object(request), "drawing"))
+            with _disk():
+                kept = session.draw(index, drawn)
         except StaleViewError as error:
             raise RefusedRequestError(HTTPStatus.CONFLICT, str(error)) from None
         return json_reply({"revision": kept.revision})
@@ -68,7 +71,8 @@ def routes(session: LabelSession, finished: Callable[[int], None]) -> Mapping[tu
         return json_reply({"shapes": [shape.model_dump(mode="json") for shape in shapes]})
 
     def finish(request: Request) -> Reply:
-        count = session.finish()
+        with _disk():
+            count = session.finish()
         finished(count)
         return json_reply({"out": str(session.out), "labelled": count})
 
@@ -102,6 +106,15 @@ def _described(session: LabelSession) -> dict[str, Any]:
         "cannot_propagate": session.cannot_propagate,
         "views": views,
     }
+
+
+@contextmanager
+def _disk() -> Iterator[None]:
+    """Tells the person at the page what the disk refused."""
+    try:
+        yield
+    except OSError as error:
+        raise RefusedRequestError(HTTPStatus.INSUFFICIENT_STORAGE, f"not written: {error}") from None
 
 
 def _index(request: Request) -> int:
