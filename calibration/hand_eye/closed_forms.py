@@ -13,6 +13,7 @@ from surfclass.errors import InputError
 from surfclass.types import Float64
 
 _LEAST_TURN_RAD = 1e-3  # of a pair; the axis of a smaller one is noise
+_MOST_PAIRS = 6000  # more take long and tell no more
 
 
 def solve_all(flange: NDArray[Any], target: NDArray[Any]) -> dict[str, Float64]:
@@ -51,12 +52,14 @@ def pair_motions(flange: NDArray[Any], target: NDArray[Any]) -> tuple[Float64, F
         raise InputError(f"hand-eye: poses {f.shape} and {t.shape}, needed are 3 or more pairs of (n, 4, 4)")
     # Each pair both ways: noise makes a motion and its inverse count a little differently.
     first, second = np.nonzero(~np.eye(len(f), dtype=np.bool_))
-    a = np.linalg.inv(f[second]) @ f[first]
-    b = t[second] @ np.linalg.inv(t[first])
-    turned = np.linalg.norm(rotation_vector(a[:, :3, :3]), axis=1) > _LEAST_TURN_RAD
+    chord = np.linalg.norm(f[second, :3, :3] - f[first, :3, :3], axis=(1, 2)) / np.sqrt(2)
+    turned = chord > _LEAST_TURN_RAD
     if not turned.any():
         raise InputError("hand-eye: no two poses differ by a turn")
-    return a[turned], b[turned]
+    if len(first) > _MOST_PAIRS:  # those that turn most tell most
+        turned &= chord >= np.partition(chord, -_MOST_PAIRS)[-_MOST_PAIRS] * (1 - 1e-12)
+    first, second = first[turned], second[turned]
+    return np.linalg.inv(f[second]) @ f[first], t[second] @ np.linalg.inv(t[first])
 
 
 def tsai_lenz(a: Float64, b: Float64) -> Float64:

@@ -14,7 +14,9 @@ from calibration.hand_eye.problem import Problem
 from calibration.hand_eye.start import moving, target_poses
 from calibration.rotations import difference
 from surfclass.errors import InputError
-from surfclass.types import Float64, Transform
+from surfclass.types import Bool, Float64, Transform
+
+_MOST_LEFT_OUT = 60  # poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +27,8 @@ class ClosedForm:
         x: (4, 4) the hand-eye transform.
         apart: (6,) from the joint adjustment's: rotation vector (rad), translation (m).
         rms: Of its residuals, px and m; None for what was not seen.
-        left_out: Likewise, each pose predicted by the others.
+        left_out: Likewise, each pose predicted by the others; None for sets of many poses, where it
+            would take long.
     """
 
     x: Float64
@@ -63,9 +66,11 @@ def rms_of(problem: Problem, fit: Fit, misses: Misses) -> tuple[float | None, fl
 
 
 def _left_out(
-    problem: Problem, fit: Fit, arm: Float64, poses: Float64, used: np.ndarray
+    problem: Problem, fit: Fit, arm: Float64, poses: Float64, used: Bool
 ) -> dict[str, tuple[float | None, float | None]]:
     each: dict[str, Misses] = {}
+    if used.sum() > _MOST_LEFT_OUT:
+        return {}
     for pose in np.flatnonzero(used):
         rest = used.copy()
         rest[pose] = False
