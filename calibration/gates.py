@@ -102,15 +102,17 @@ class LimitsGates(Table):
 class TrainGates(Table):
     """Of `train`: on places that the model was not trained on, of the colour feature in use and of texture.
 
+    How good a model can be depends on the surfaces: the defaults refuse only what is no use at all.
+
     Attributes:
         colour_accuracy: The least share of samples that are right, mean over the classes.
         texture_accuracy: Likewise, of windows.
         ece: The greatest expected calibration error.
     """
 
-    colour_accuracy: Annotated[Positive, Field(le=1)] = 0.6
-    texture_accuracy: Annotated[Positive, Field(le=1)] = 0.5
-    ece: Annotated[Positive, Field(le=1)] = 0.1
+    colour_accuracy: Annotated[Positive, Field(le=1)] = 0.4
+    texture_accuracy: Annotated[Positive, Field(le=1)] = 0.3
+    ece: Annotated[Positive, Field(le=1)] = 0.25
 
 
 class VerifyGates(Table):

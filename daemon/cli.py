@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.cli_calibrate import calibrate, label, verify
+from daemon.cli_calibrate import calibrate, label, train, verify
 from daemon.cli_options import (
     EXIT_CONFIGURATION,
     EXIT_DEVICE,
@@ -58,6 +58,7 @@ app = typer.Typer(
     """,
 )
 app.add_typer(calibrate, name="calibrate")
+app.command()(train)
 app.command()(label)
 app.command()(verify)
 app.add_typer(show, name="show")
@@ -116,36 +117,6 @@ def recover(
     from drivers.recordings import recover as recover_recording
 
     offline.console.print(f"{recover_recording(path)}")
-
-
-class ClassifierKind(StrEnum):
-    """Kinds of classifiers."""
-
-    svm = "svm"
-    naive_bayes = "naive-bayes"
-
-
-@app.command()
-def train(
-    recording: RecordingArgument,
-    out: Annotated[Path, typer.Option("--out", metavar="MODEL", help="Where the model goes.")],
-    thesis: Annotated[
-        bool, typer.Option("--thesis", help="K_d by the printed polynomial even if the full model is there.")
-    ] = False,
-    classifier: Annotated[ClassifierKind, typer.Option(help="Of both routes.")] = ClassifierKind.svm,
-    seed: Annotated[int, typer.Option(min=0, help="Of drawing samples and folds.")] = 0,
-) -> None:
-    """Train both routes from a recording's labelled `train` captures."""
-    from daemon import offline
-    from surfclass.training import TrainingSettings
-
-    settings = TrainingSettings(
-        classifier="svm" if classifier is ClassifierKind.svm else "naive_bayes",
-        reflectance="thesis" if thesis else None,
-        seed=seed,
-    )
-    model = offline.train_model(recording, out, settings)
-    offline.console.print(f"{out}: {', '.join(model.colour)}, {model.texture.feature}")
 
 
 @app.command()
@@ -322,11 +293,16 @@ def demo(
     real_drivers: Annotated[
         bool, typer.Option("--real-drivers", help="By OpenNI2, Aravis, serial line and b-CAP.")
     ] = False,
+    commission: Annotated[
+        bool, typer.Option("--commission", help="Find the rig by every commissioning step; 3 minutes more.")
+    ] = False,
 ) -> None:
     """Everything once, on the simulated cell: commission, train, map with a service, watch it, score it."""
     from daemon.demo import run_demo
 
-    raise typer.Exit(run_demo(out, seed, viewpoints, real_drivers))
+    if commission and real_drivers:
+        raise typer.BadParameter("--commission is of the simulated devices; leave --real-drivers out")
+    raise typer.Exit(run_demo(out, seed, viewpoints, real_drivers, commission))
 
 
 def _settings(thesis: bool, update: Update | None, pool: Pool | None) -> PipelineSettings:

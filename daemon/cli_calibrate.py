@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -34,6 +34,12 @@ calibrate = typer.Typer(
     no_args_is_help=True,
     help="Commission the sensor package: cameras, hand-eye, response, light, limits; and what is in use.",
 )
+PageOption = Annotated[
+    bool, typer.Option("--page/--no-page", help="Show live captures on a page in the browser.")
+]
+IdleOption = Annotated[
+    float, typer.Option("--idle-s", min=1, help="A live capture ends after so long without a view.")
+]
 
 
 @calibrate.callback()
@@ -77,6 +83,8 @@ def cameras(
     json_: JsonOption = None,
     pictures: PicturesOption = None,
     new_devices: NewDevicesOption = False,
+    page: PageOption = True,
+    idle_s: IdleOption = 900.0,
     board: Annotated[
         str | None, typer.Option(metavar="9x6", help="Inner corners of the board, columns x rows.")
     ] = None,
@@ -91,7 +99,9 @@ def cameras(
     from daemon import commissioning_steps
 
     told = commissioning_steps.BoardTold(board, square_mm, charuco, marker_mm)
-    call = commissioning_steps.call("cameras", config, set_, from_, calibration, json_, pictures, new_devices)
+    call = commissioning_steps.call(
+        "cameras", config, set_, from_, calibration, json_, pictures, new_devices, page, idle_s
+    )
     raise typer.Exit(commissioning_steps.cameras(call, told))
 
 
@@ -101,6 +111,7 @@ class Target(StrEnum):
     discs = "discs"
     checkerboard = "checkerboard"
     charuco = "charuco"
+    spheres = "spheres"
 
 
 @calibrate.command("hand-eye")
@@ -112,6 +123,8 @@ def hand_eye(
     json_: JsonOption = None,
     pictures: PicturesOption = None,
     new_devices: NewDevicesOption = False,
+    page: PageOption = True,
+    idle_s: IdleOption = 900.0,
     observations: Annotated[
         Path | None,
         typer.Option(metavar="OBS.json", help="Any target, found by any program: poses and points."),
@@ -123,6 +136,11 @@ def hand_eye(
     square_mm: Annotated[float | None, typer.Option(min=1, help="Side of a square.")] = None,
     charuco: Annotated[str | None, typer.Option(metavar="DICT", help="A ChArUco board's dictionary.")] = None,
     marker_mm: Annotated[float | None, typer.Option(min=1, help="Side of a ChArUco marker.")] = None,
+    sphere_radii_mm: Annotated[tuple[float, float], typer.Option(help="Of the two spheres on a rod.")] = (
+        12.0,
+        10.0,
+    ),
+    sphere_distance_mm: Annotated[float, typer.Option(help="Between the spheres' centres.")] = 50.26,
     joint_offsets: Annotated[
         bool,
         typer.Option("--joint-offsets", help="Also find the joints' offsets that can be seen."),
@@ -136,10 +154,18 @@ def hand_eye(
 
     told = commissioning_steps.BoardTold(board, square_mm, charuco, marker_mm)
     call = commissioning_steps.call(
-        "hand-eye", config, set_, from_, calibration, json_, pictures, new_devices
+        "hand-eye", config, set_, from_, calibration, json_, pictures, new_devices, page, idle_s
     )
+    if target is Target.spheres:
+        rod = commissioning_steps.rod(sphere_radii_mm, sphere_distance_mm)
+        raise typer.Exit(commissioning_steps.spheres(call, rod))
+    kinds: dict[Target, Literal["discs", "checkerboard", "charuco"]] = {
+        Target.discs: "discs",
+        Target.checkerboard: "checkerboard",
+        Target.charuco: "charuco",
+    }
     raise typer.Exit(
-        commissioning_steps.hand_eye(call, observations, target.value, told, joint_offsets, flange_offset)
+        commissioning_steps.hand_eye(call, observations, kinds[target], told, joint_offsets, flange_offset)
     )
 
 
@@ -152,12 +178,14 @@ def response(
     json_: JsonOption = None,
     pictures: PicturesOption = None,
     new_devices: NewDevicesOption = False,
+    page: PageOption = True,
+    idle_s: IdleOption = 900.0,
 ) -> None:
     """How the colour camera turns light into numbers, its dark level and its noise."""
     from daemon import commissioning_steps
 
     call = commissioning_steps.call(
-        "response", config, set_, from_, calibration, json_, pictures, new_devices
+        "response", config, set_, from_, calibration, json_, pictures, new_devices, page, idle_s
     )
     raise typer.Exit(commissioning_steps.response(call))
 
@@ -179,16 +207,24 @@ def light(
     json_: JsonOption = None,
     pictures: PicturesOption = None,
     new_devices: NewDevicesOption = False,
+    page: PageOption = True,
+    idle_s: IdleOption = 900.0,
     use: Annotated[Use, typer.Option(help="Semi-gloss boards, the Lambertian series, or both.")] = Use.all,
     thesis: Annotated[
         bool, typer.Option("--thesis", help="Only the position, board by board, by Eq. 4.5-4.10.")
     ] = False,
+    also: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="REC.mcap", help="Earlier captures that count, too."),
+    ] = None,
 ) -> None:
     """Where the LED is, where it points, how it falls off, and the lens' vignetting, all at once."""
     from daemon import commissioning_steps
 
-    call = commissioning_steps.call("light", config, set_, from_, calibration, json_, pictures, new_devices)
-    raise typer.Exit(commissioning_steps.light(call, use.value, thesis))
+    call = commissioning_steps.call(
+        "light", config, set_, from_, calibration, json_, pictures, new_devices, page, idle_s
+    )
+    raise typer.Exit(commissioning_steps.light(call, use.value, thesis, also or ()))
 
 
 @calibrate.command()
@@ -200,15 +236,59 @@ def limits(
     json_: JsonOption = None,
     pictures: PicturesOption = None,
     new_devices: NewDevicesOption = False,
+    page: PageOption = True,
+    idle_s: IdleOption = 900.0,
     model: Annotated[
         Path | None, typer.Option(metavar="MODEL", help="What `train` wrote; else one is trained here.")
+    ] = None,
+    classes: Annotated[
+        Path | None, typer.Option(metavar="CLASSES.toml", help="Live: what the labels mean.")
+    ] = None,
+    surface: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Live: a board of this surface; may be repeated.")
     ] = None,
 ) -> None:
     """From where to where, and how obliquely, each surface's texture can be trusted."""
     from daemon import commissioning_steps
 
-    call = commissioning_steps.call("limits", config, set_, from_, calibration, json_, pictures, new_devices)
-    raise typer.Exit(commissioning_steps.limits(call, model))
+    call = commissioning_steps.call(
+        "limits", config, set_, from_, calibration, json_, pictures, new_devices, page, idle_s
+    )
+    raise typer.Exit(commissioning_steps.limits(call, model, classes, surface or ()))
+
+
+class ClassifierKind(StrEnum):
+    """Kinds of classifiers."""
+
+    svm = "svm"
+    naive_bayes = "naive-bayes"
+
+
+def train(
+    recording: RecordingArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="MODEL", help="Where the model goes.")],
+    thesis: Annotated[
+        bool, typer.Option("--thesis", help="K_d by the printed polynomial even if the full model is there.")
+    ] = False,
+    classifier: Annotated[ClassifierKind, typer.Option(help="Of both routes.")] = ClassifierKind.svm,
+    seed: Annotated[int, typer.Option(min=0, help="Of drawing samples and folds.")] = 0,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    calibration: CalibrationOption = None,
+    json_: JsonOption = None,
+    pictures: PicturesOption = None,
+) -> None:
+    """Train both routes from a recording's labelled `train` captures, and say how good the model is."""
+    from daemon import commissioning_steps
+    from surfclass.training import TrainingSettings
+
+    settings = TrainingSettings(
+        classifier="svm" if classifier is ClassifierKind.svm else "naive_bayes",
+        reflectance="thesis" if thesis else None,
+        seed=seed,
+    )
+    call = commissioning_steps.call("train", config, set_, [recording], calibration, json_, pictures)
+    raise typer.Exit(commissioning_steps.train(call, out, settings))
 
 
 def verify(
@@ -222,14 +302,23 @@ def verify(
     report: Annotated[
         Path | None, typer.Option(metavar="REPORT.html", help="One page, with pictures, to print or to send.")
     ] = None,
+    board: Annotated[
+        str | None, typer.Option(metavar="9x6", help="Inner corners of the board, columns x rows.")
+    ] = None,
+    square_mm: Annotated[float | None, typer.Option(min=1, help="Side of a square.")] = None,
+    require: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PART", help="Must be checked: cameras, discs, grey_card, boards."),
+    ] = None,
     json_: JsonOption = None,
     pictures: PicturesOption = None,
 ) -> None:
     """Re-check the whole chain with fresh captures: discs, grey card, labelled boards."""
     from daemon import commissioning_steps
 
+    told = commissioning_steps.BoardTold(board, square_mm, None, None)
     call = commissioning_steps.call("verify", config, set_, from_, calibration, json_, pictures)
-    raise typer.Exit(commissioning_steps.verify(call, model, report))
+    raise typer.Exit(commissioning_steps.verify(call, model, report, told, require or ()))
 
 
 def label(

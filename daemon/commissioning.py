@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 from rich.table import Table
 
+from calibration.cameras.pairs import ImagePairs, holds_pairs
 from calibration.gates import Gates
-from calibration.guide import Guide
 from calibration.outcome import Kind, Note, Outcome, RefusedError, refused
 from calibration.source import Source, sha256
 from calibration.store import KINDS, Provenance, Store, described
@@ -23,10 +23,10 @@ from surfclass.errors import ConfigurationError, InputError
 from surfclass.rig import DepthRig
 
 if TYPE_CHECKING:
-    from daemon.commissioning_live import Texts
+    from daemon.commissioning_live import Texts, Wanted
 
-Targets = Callable[[Config, DepthRig], tuple[Sequence[Guide], "Texts"]]
-Solve = Callable[[Source | None, Gates, Note], Outcome]
+Targets = Callable[[Config, DepthRig], tuple["Sequence[Wanted]", "Texts"]]
+Solve = Callable[[Source | ImagePairs | None, Gates, Note], Outcome]
 _STYLE = {"pass": "bold green", "fail": "bold red", "refused": "bold yellow"}
 
 
@@ -45,6 +45,7 @@ class Call:
         options: What the step was told, for the record.
         new_devices: Whether another camera than the one of the result in use is expected.
         page: Whether live captures are shown on a page in the browser.
+        idle_s: A live capture ends after so long without a view.
         also: Earlier recordings that are solved with the live one.
         files: What else is read, such as observations or a model.
     """
@@ -59,6 +60,7 @@ class Call:
     options: Mapping[str, Any] = field(default_factory=dict)
     new_devices: bool = False
     page: bool = True
+    idle_s: float = 900.0
     also: tuple[Path, ...] = ()
     files: tuple[Path, ...] = ()
 
@@ -77,7 +79,7 @@ class Ended:
 
     outcome: Outcome
     told: Mapping[str, Any]
-    source: Source | None
+    source: Source | ImagePairs | None
     store: Store | None
     robot: str
 
@@ -108,7 +110,7 @@ def commission(
     paths = call.from_
     if not paths and targets is not None:
         paths = (_captured(call, config, targets), *call.also)
-    source = None if not paths else _opened(paths, store)
+    source = None if not paths else _opened(call.kind, paths, store)
     with console.status(f"{call.kind}: reading") as status:
 
         def note(sentence: str) -> None:
@@ -116,7 +118,7 @@ def commission(
             console.print(f"  {escape(sentence)}", highlight=False)
 
         try:
-            if source is not None and store is not None and not call.new_devices:
+            if isinstance(source, Source) and store is not None and not call.new_devices:
                 _same_devices(source, store)
             outcome = solve(source, gates, note)
         except RefusedError as error:
@@ -124,7 +126,9 @@ def commission(
     _print(outcome)
     told = described(outcome, _provenance(call, source, gates), _rig_after(source, outcome))
     _draw(outcome, call.pictures)
-    if store is not None and outcome.kind in KINDS and outcome.verdict != "refused":
+    # What was found of bare image pairs is of no package that is known.
+    kept = outcome.kind in KINDS and outcome.verdict != "refused" and not isinstance(source, ImagePairs)
+    if store is not None and kept:
         path = store.add(call.kind, told)
         in_use = "in use from now on" if outcome.verdict == "pass" else "kept, and not in use"
         console.print(f"{path}: {in_use}", highlight=False, soft_wrap=True)
@@ -159,13 +163,15 @@ def _captured(call: Call, config: Config | None, targets: Targets) -> Path:
         raise ConfigurationError("give --from REC.mcap, or --config FILE whose devices capture now")
     from daemon.commissioning_live import record  # late: it brings every driver's options
 
-    guides, texts = targets(config, depth_rig_of(config)[1])
-    path = record(config, call.kind, guides, texts, call.page)
+    wanted, texts = targets(config, depth_rig_of(config)[1])
+    path = record(config, call.kind, wanted, texts, call.page, call.idle_s)
     console.print(f"{path}: what was captured; `--from {path}` solves it again", highlight=False)
     return path
 
 
-def _opened(paths: Sequence[Path], store: Store | None) -> Source:
+def _opened(kind: Kind, paths: Sequence[Path], store: Store | None) -> Source | ImagePairs:
+    if kind == "cameras" and len(paths) == 1 and holds_pairs(paths[0]):
+        return ImagePairs.open(paths[0])
     source = Source.open(*paths)
     return source if store is None else source.with_values(store.values())
 
@@ -185,16 +191,17 @@ def _same_devices(source: Source, store: Store) -> None:
         raise RefusedError(*differing)
 
 
-def _provenance(call: Call, source: Source | None, gates: Gates) -> Provenance:
+def _provenance(call: Call, source: Source | ImagePairs | None, gates: Gates) -> Provenance:
     own = gates.model_dump().get(call.kind.replace("-", "_"), {})
     digests = {str(path): sha256(path) for path in call.files}
     if source is None:
         return Provenance(", ".join(digests), digests, call.options, own, {})
-    return Provenance(str(source.path), source.digests() | digests, call.options, own, source.devices)
+    devices = source.devices if isinstance(source, Source) else {}
+    return Provenance(str(source.path), source.digests() | digests, call.options, own, devices)
 
 
-def _rig_after(source: Source | None, outcome: Outcome) -> DepthRig | None:
-    return None if source is None else source.rig.with_values(outcome.rig)
+def _rig_after(source: Source | ImagePairs | None, outcome: Outcome) -> DepthRig | None:
+    return source.rig.with_values(outcome.rig) if isinstance(source, Source) else None
 
 
 def _print(outcome: Outcome) -> None:

@@ -29,6 +29,23 @@ CAPTURES = "captures"
 """Where recordings go, below the directory of the results."""
 
 
+def _as_it_is(capture: Capture) -> Capture:
+    return capture
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Views of one target.
+
+    Attributes:
+        guide: Judges them.
+        finish: What an accepted view becomes before it is written, such as a labelled one.
+    """
+
+    guide: Guide
+    finish: Callable[[Capture], Capture] = _as_it_is
+
+
 @dataclass(frozen=True, slots=True)
 class Texts:
     """Files that travel in the recording.
@@ -45,17 +62,22 @@ class Texts:
 
 
 def record(
-    config: Config, what: str, guides: Sequence[Guide], texts: Texts, page: bool, out: Path | None = None
+    config: Config,
+    what: str,
+    wanted: Sequence[Wanted],
+    texts: Texts,
+    page: bool,
+    idle_s: float,
 ) -> Path:
     """Captures what a step needs with the configured devices and returns the finished recording.
 
     Args:
         config: The devices, and where the recording goes: below the directory of the results.
         what: Of the file's name and for the person, such as "cameras".
-        guides: One after the other; between them the target is changed.
+        wanted: One after the other; between them the target is changed.
         texts: What travels in the recording besides the rig.
         page: Whether a page shows the views in a browser.
-        out: The recording; None: a new file of its own.
+        idle_s: It ends after so long without a view.
 
     Raises:
         DriverError, CaptureRejectedError: As the devices do; what was accepted is a finished recording.
@@ -63,11 +85,11 @@ def record(
         ConfigurationError: If there are no devices, or the configuration has no place for results.
         InputError: If nothing was accepted.
     """
-    path = out or _place(config, what)
+    path = _place(config, what)
     rig_text, _ = wiring.depth_rig_of(config)
     sensors = wiring.build_sensors(config, with_ir=True)
     offset_ns = 0 if config.simulated else unix_offset_ns()
-    settings = GuidedSettings(title=what, with_dark=config.capture.dark)
+    settings = GuidedSettings(title=what, with_dark=config.capture.dark, idle_s=idle_s)
     with sensors.package as package, ExitStack() as shown, _signals() as stopped:
         typed = sys.stdin if sys.stdin.isatty() else None
         uis: list[ScopedUi] = [shown.enter_context(TerminalUi(console, typed))]
@@ -86,7 +108,7 @@ def record(
         )
         guided_all(
             package,
-            [(guide, _as_it_is) for guide in guides],
+            [(one.guide, one.finish) for one in wanted],
             writer,
             settings,
             Several(uis),
@@ -106,10 +128,6 @@ def _place(config: Config, what: str) -> Path:
         raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
     now = datetime.datetime.now(datetime.UTC)
     return folder / f"{what}-{now:%Y%m%dT%H%M%SZ}.mcap"
-
-
-def _as_it_is(capture: Capture) -> Capture:
-    return capture
 
 
 @contextlib.contextmanager

@@ -6,27 +6,32 @@ import importlib.metadata
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tomli_w
 
+from calibration.cameras.pairs import ImagePairs
 from calibration.gates import Gates
-from calibration.guide import Guide
 from calibration.outcome import Kind, Note, Outcome
 from calibration.source import Source
 from calibration.store import KINDS
 from calibration.verify.report import About, html, report_of
 from daemon.commissioning import Call, Ended, commission
-from daemon.commissioning_live import Texts
+from daemon.commissioning_live import Texts, Wanted
 from daemon.config import Config
 from daemon.offline import console, open_recording
 from drivers.files import check_output, read_file, write_atomically
 from drivers.recordings.board import Board, parse_board
 from drivers.recordings.plate import Plate, parse_plate
 from surfclass.errors import ConfigurationError
-from surfclass.rig import DepthRig
+from surfclass.rig import DepthRig, parse_classes
 from surfclass.schema import validate
+from surfclass.training import TrainingSettings
 
+if TYPE_CHECKING:
+    from calibration.hand_eye.spheres_command import SpheresOptions
+
+Given = Source | ImagePairs | None
 _VERSIONS = ("surfclass", "numpy", "opencv-python-headless", "pin")
 
 
@@ -78,6 +83,8 @@ def call(
     json_file: str | None,
     pictures: Path | None,
     new_devices: bool = False,
+    page: bool = True,
+    idle_s: float = 900.0,
 ) -> Call:
     """Returns how a step was called."""
     return Call(
@@ -120,8 +127,8 @@ def hand_eye(
     observations: Path | None,
     target: Literal["discs", "checkerboard", "charuco"],
     told: BoardTold,
-    joint_offsets: bool,
-    flange_offset: bool,
+    joint_offsets: bool = False,
+    flange_offset: bool = False,
 ) -> int:
     """Runs `calibrate hand-eye` and returns the exit code."""
     from calibration.hand_eye.command import Options, calibrate
@@ -141,50 +148,112 @@ def hand_eye(
         files=() if observations is None else (observations,),
     )
 
-    def solve(source: Source | None, gates: Gates, note: Note) -> Outcome:
+    def solve(source: Given, gates: Gates, note: Note) -> Outcome:
+        assert source is None or isinstance(source, Source)
         return calibrate(source, options, gates.hand_eye, note)
 
-    def targets(config: Config, rig: DepthRig) -> tuple[Sequence[Guide], Texts]:
+    def targets(config: Config, rig: DepthRig) -> tuple[Sequence[Wanted], Texts]:
         if target == "discs":
             text, plate = plate_of(config)
-            return [HandEyeGuide(rig, plate)], Texts(plate=text)
+            return [Wanted(HandEyeGuide(rig, plate))], Texts(plate=text)
         text, seen = board_of(config, board)
-        return [HandEyeGuide(rig, seen)], Texts(board=text)
+        return [Wanted(HandEyeGuide(rig, seen))], Texts(board=text)
 
     return commission(call, solve, None if observations is not None else targets)
+
+
+def cameras(call: Call, told: BoardTold) -> int:
+    """Runs `calibrate cameras` and returns the exit code."""
+    from calibration.cameras.command import Options, calibrate
+    from calibration.cameras.guide import CamerasGuide
+
+    board = told.board()
+    options = Options(board=board)
+
+    def solve(source: Given, gates: Gates, note: Note) -> Outcome:
+        assert source is not None  # there are captures, or the call has failed
+        return calibrate(source, options, gates.cameras, note)
+
+    def targets(config: Config, rig: DepthRig) -> tuple[Sequence[Wanted], Texts]:
+        text, seen = board_of(config, board)
+        return [Wanted(CamerasGuide(rig, seen))], Texts(board=text)
+
+    options_told = {"board": None if board is None else str(board)}
+    return commission(replace(call, options=options_told), solve, targets)
+
+
+def rod(radii_mm: tuple[float, float], distance_mm: float) -> SpheresOptions:
+    """Returns the rod with two spheres, of which the first one is nearer to its tip."""
+    from calibration.hand_eye.spheres_command import SpheresOptions
+
+    return SpheresOptions((radii_mm[0] / 1e3, radii_mm[1] / 1e3), distance_mm / 1e3)
+
+
+def spheres(call: Call, options: SpheresOptions) -> int:
+    """Runs `calibrate hand-eye --target spheres` on a folder of captures and returns the exit code."""
+    from calibration.hand_eye.spheres_command import calibrate_spheres
+
+    if len(call.from_) != 1 or not call.from_[0].is_dir():
+        raise ConfigurationError("--target spheres: --from a folder with ir/, clouds.npz, marker_base_m.csv")
+    folder = call.from_[0]
+
+    def solve(_: Given, gates: Gates, note: Note) -> Outcome:
+        return calibrate_spheres(folder, options, gates.hand_eye, note)
+
+    # A fixed camera is no part of the package on the arm: the result is told, and never put into use.
+    files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
+    options_told = {"target": "spheres", **asdict(options)}
+    alone = replace(call, from_=(), directory=None, config=None, overrides=())
+    return commission(replace(alone, options=options_told, files=files), solve)
 
 
 def response(call: Call) -> int:
     """Runs `calibrate response` and returns the exit code."""
     from calibration.response.command import Options, calibrate
+    from calibration.response.guide import ResponseGuide
 
-    def solve(source: Source | None, gates: Gates, note: Note) -> Outcome:
-        assert source is not None  # there are captures, or the call has failed
+    def solve(source: Given, gates: Gates, note: Note) -> Outcome:
+        assert isinstance(source, Source)  # there are captures, or the call has failed
         return calibrate(source, Options(), gates.response, note)
 
-    return commission(call, solve)
+    def targets(config: Config, rig: DepthRig) -> tuple[Sequence[Wanted], Texts]:
+        return [Wanted(ResponseGuide(rig, "exposure"))], Texts()
+
+    return commission(call, solve, targets)
 
 
-def verify(call: Call, model: Path | None, report: Path | None) -> int:
+def verify(
+    call: Call, model: Path | None, report: Path | None, told: BoardTold, require: Sequence[str] = ()
+) -> int:
     """Runs `verify`, writes its report, and returns the exit code."""
     from calibration.verify.command import VerifyOptions
     from calibration.verify.command import verify as check
 
     check_output(report)
-    options = VerifyOptions(model)
+    options = VerifyOptions(model, told.board(), tuple(require))
     if model is not None:
         call = replace(call, options={"model": str(model)}, files=(model,))
 
-    def solve(source: Source | None, gates: Gates, note: Note) -> Outcome:
-        assert source is not None  # there are captures, or the call has failed
+    def solve(source: Given, gates: Gates, note: Note) -> Outcome:
+        assert isinstance(source, Source)  # there are captures, or the call has failed
         return check(source, options, gates.verify, note)
 
     def write_report(ended: Ended) -> None:
+        _warn_of_old_captures(ended)
         if report is not None:
             write_atomically(report, html(report_of(ended.outcome, about(ended))).encode())
             console.print(f"{report}: to read, to print, or to send", highlight=False)
 
     return commission(call, solve, None, write_report)
+
+
+def _warn_of_old_captures(ended: Ended) -> None:
+    """Says where the captures are those that a result in use was found from: they check nothing then."""
+    results = [] if ended.store is None else [ended.store.current(kind) for kind in KINDS]
+    seen = set(ended.told["inputs"].values())
+    for one in results:
+        if one is not None and seen & set(one.told.get("inputs", {}).values()):
+            console.print(f"  {one.path} was found from these very captures: take new ones", style="yellow")
 
 
 def about(ended: Ended) -> About:
@@ -193,7 +262,7 @@ def about(ended: Ended) -> About:
     return About(
         written=str(ended.told["written"])[:19].replace("T", " ") + " UTC",
         robot=ended.robot or "–",
-        rig="–" if ended.source is None else ended.source.rig.name,
+        rig=ended.source.rig.name if isinstance(ended.source, Source) else "–",
         source=str(ended.told["source"]),
         versions={name: importlib.metadata.version(name) for name in _VERSIONS},
         inputs=ended.told["inputs"],
@@ -217,14 +286,76 @@ def label(recording: Path, out: Path, classes: Path | None, directory: Path | No
     return 0 if count else 1
 
 
-def light(call: Call, use: Literal["all", "boards", "lambertian"], thesis: bool) -> int:
+def light(
+    call: Call,
+    use: Literal["all", "boards", "lambertian"],
+    thesis: bool = False,
+    also: Sequence[Path] = (),
+) -> int:
     """Runs `calibrate light` and returns the exit code."""
     from calibration.light.command import Options, calibrate
+    from calibration.light.guide import LightGuide
+    from calibration.response.guide import ResponseGuide
 
     options = Options(use=use, thesis=thesis)
 
-    def solve(source: Source | None, gates: Gates, note: Note) -> Outcome:
-        assert source is not None  # there are captures, or the call has failed
+    def solve(source: Given, gates: Gates, note: Note) -> Outcome:
+        assert isinstance(source, Source)  # there are captures, or the call has failed
         return calibrate(source, options, gates.light, note)
 
-    return commission(replace(call, options=asdict(options)), solve)
+    def targets(config: Config, rig: DepthRig) -> tuple[Sequence[Wanted], Texts]:
+        boards, card = Wanted(LightGuide(rig)), Wanted(ResponseGuide(rig, "distance"))
+        wanted = {"boards": [boards], "lambertian": [card], "all": [boards, card]}
+        return wanted[use], Texts()
+
+    return commission(replace(call, options=asdict(options), also=tuple(also)), solve, targets)
+
+
+def limits(
+    call: Call, model: Path | None, classes_path: Path | None = None, surfaces: Sequence[str] = ()
+) -> int:
+    """Runs `calibrate limits` and returns the exit code."""
+    from calibration.limits.command import Options, calibrate
+    from calibration.live.labelled import LIMITS_STANDS, LabelledGuide
+
+    def solve(source: Given, gates: Gates, note: Note) -> Outcome:
+        assert isinstance(source, Source)  # there are captures, or the call has failed
+        return calibrate(source, Options(model=model), gates.limits, note)
+
+    def targets(config: Config, rig: DepthRig) -> tuple[Sequence[Wanted], Texts]:
+        if classes_path is None or not surfaces:
+            raise ConfigurationError("which boards? give --classes CLASSES.toml and --surface NAME for each")
+        text = read_file(classes_path, "classes").decode(errors="replace")
+        names = parse_classes(text, str(classes_path)).names
+        wanted = []
+        for surface in surfaces:
+            if surface not in names:
+                raise ConfigurationError(f"--surface {surface}: {classes_path} has {', '.join(names)}")
+            guide = LabelledGuide("test", surface, names.index(surface) + 1, rig.whole(), LIMITS_STANDS)
+            wanted.append(Wanted(guide, guide.labelled))
+        return wanted, Texts(classes=text)
+
+    if model is not None:
+        call = replace(call, options={"model": str(model)}, files=(model,))
+    return commission(call, solve, targets)
+
+
+def train(call: Call, out: Path, settings: TrainingSettings) -> int:
+    """Runs `train`, writes the model, and returns the exit code; what misses a limit is written too."""
+    from calibration.training.command import train_model
+
+    check_output(out)
+    models = []
+
+    def solve(source: Given, gates: Gates, note: Note) -> Outcome:
+        assert isinstance(source, Source)  # there are captures, or the call has failed
+        result = train_model(source, settings, gates.train, note)
+        models.append(result.model)
+        return result.outcome
+
+    def write_model(_: Ended) -> None:
+        for model in models:
+            write_atomically(out, model.to_bytes())
+            console.print(f"{out}: {', '.join(model.colour)}, {model.texture.feature}", highlight=False)
+
+    return commission(replace(call, options=asdict(settings)), solve, None, write_model)

@@ -16,8 +16,9 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from daemon import maps, offline, pictures
+from daemon import commissioning_steps, maps, offline, pictures
 from daemon.console import MapClient
+from daemon.demo_commissioning import commission_simulated
 from daemon.demo_stages import EmulatedStage, SimulatedStage, Stage
 from daemon.offline import console
 from daemon.processes import STOP_S, last_words, process
@@ -35,7 +36,9 @@ from surfclass.training import TrainingSettings
 _WAIT_S = 240.0
 
 
-def run_demo(out: Path, seed: int, viewpoints: int, real_drivers: bool = False) -> int:
+def run_demo(
+    out: Path, seed: int, viewpoints: int, real_drivers: bool = False, commission: bool = False
+) -> int:
     """Runs the demo into `out` and returns the exit code: 0 if the console's map equals the service's.
 
     Args:
@@ -44,6 +47,7 @@ def run_demo(out: Path, seed: int, viewpoints: int, real_drivers: bool = False) 
         viewpoints: How many places are visited.
         real_drivers: Through OpenNI2, Aravis, the light's serial protocol and b-CAP, with an emulated
             device behind each, instead of simulated devices.
+        commission: Find the rig by the commissioning steps instead of taking it from the simulation.
 
     Raises:
         InputError: If a step finds its input unusable; the message says which.
@@ -57,8 +61,10 @@ def run_demo(out: Path, seed: int, viewpoints: int, real_drivers: bool = False) 
     if real_drivers:
         console.rule("0  start the emulated devices")
     with stage:
-        console.rule("1  commission from the simulation's truth")
-        rig_text, classes_text = stage.rig(), truth.classes_toml()
+        how = "by capturing its targets" if commission else "from the simulation's truth"
+        console.rule(f"1  commission {how}")
+        rig_text = commission_simulated(out, seed) if commission else stage.rig()
+        classes_text = truth.classes_toml()
         write_atomically(out / "rig.toml", rig_text.encode())
         write_atomically(out / "classes.toml", classes_text.encode())
         console.print(f"rig.toml, classes.toml: {len(parse_classes(classes_text, 'classes').names)} surfaces")
@@ -66,7 +72,9 @@ def run_demo(out: Path, seed: int, viewpoints: int, real_drivers: bool = False) 
         console.rule("2  train from one board of each surface, at 0.65 m and 0°")
         _capture_boards(out / "train.mcap", rig_text, classes_text, seed, stage)
         devices = stage.cell()
-        offline.train_model(out / "train.mcap", out / "model.npz", TrainingSettings())
+        call = commissioning_steps.call("train", None, None, [out / "train.mcap"], None, None, None)
+        if commissioning_steps.train(call, out / "model.npz", TrainingSettings()):
+            raise InputError("the model is of no use; see above")
 
         console.rule(f"3  map the cell from {viewpoints} viewpoints: service and console in two processes")
         recorded, stage_ms = _map_cell(out, viewpoints, devices, stage)
@@ -95,7 +103,8 @@ def run_demo(out: Path, seed: int, viewpoints: int, real_drivers: bool = False) 
 
 def _clear(out: Path) -> None:
     """Removes what an earlier demo left; nothing that a demo does not write."""
-    shutil.rmtree(out / "recordings", ignore_errors=True)
+    for folder in ("recordings", "calibration"):
+        shutil.rmtree(out / folder, ignore_errors=True)
     for pattern in ("*.mcap", "*.mcap.active", "*.npz", "*.png", "*.ply", "*.json", "*.toml", "*.log"):
         for path in out.glob(pattern):
             path.unlink()

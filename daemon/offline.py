@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-import calibration.train
 from calibration.store import Store
 from drivers.files import check_output, read_file, write_atomically
 from drivers.recordings import Recording, RecordingWriter
@@ -27,7 +26,6 @@ from surfclass.kinematics import depth_pose
 from surfclass.map_file import MapFile, from_npz_bytes, to_npz_bytes
 from surfclass.model import Model
 from surfclass.pipeline import Pipeline, PipelineSettings
-from surfclass.training import TrainingSettings
 
 console = Console(stderr=True)
 
@@ -106,17 +104,6 @@ def load_model(path: Path) -> Model:
         InputError, ConfigurationError: If it cannot be read, or is not one.
     """
     return Model.from_bytes(read_file(path, "model"), str(path))
-
-
-def train_model(recording_path: Path, out: Path, settings: TrainingSettings) -> Model:
-    """Trains from a recording's `train` captures, saying what it does, and writes the model."""
-    with console.status("training") as status:
-
-        def note(sentence: str) -> None:
-            status.update(sentence)
-            console.print(f"  {sentence}", highlight=False)
-
-        return calibration.train.train_model(recording_path, out, settings, note)
 
 
 def replay(
