@@ -79,12 +79,9 @@ def calibrate(source: Source, options: LightOptions, gates: LightGates, note: No
     values: dict[str, Any] = rig_values(estimate)
     if response:
         values["response"] = response
-    elif rig.response is not None:
-        values["response"] = {}
     variation, polynomial = _variation(source, rig, values, estimate)
     if polynomial is not None:
         values["response"] = {**values.get("response", {}), "a2_a1_a0": polynomial.tolist()}
-    values = {key: value for key, value in values.items() if value}
     compared = None
     if source.count("light"):
         compared = locate_by_each_board(source, rig.with_values(values).whole(), inverse)
