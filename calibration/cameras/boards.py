@@ -56,7 +56,7 @@ def find_board(image: NDArray[Any], board: Board, *, quick: bool = False) -> Fou
     rough = find_checkerboard(grey, size, quick=quick)
     if rough is None:
         return None
-    corners = refine(grey, rough, size)
+    corners = refine(grey, rough, size, quick=quick)
     placed = np.isfinite(corners[:, 0])
     if placed.mean() < _LEAST_PLACED:
         return None

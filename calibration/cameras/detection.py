@@ -70,8 +70,10 @@ def _attempts(grey: Float32, quick: bool) -> Iterator[tuple[Grey, float]]:
     """
     root = np.sqrt(np.maximum(grey - grey.min(), 0))
     small = max(grey.shape) < 1000
-    scales = (2.0, 1.0) if small else (1.0, 0.5)
-    for scale in scales[:1] if quick else scales:
+    scales: tuple[float, ...] = (2.0, 1.0) if small else (1.0, 0.5)
+    if quick:
+        scales = scales[:1] if small else scales[1:]
+    for scale in scales:
         for smoothing in _QUICK_SMOOTHINGS if quick else _SMOOTHINGS:
             smooth = cv2.GaussianBlur(root, (0, 0), smoothing) if smoothing else root
             way = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA

@@ -10,7 +10,8 @@ import numpy as np
 from surfclass.types import Float32, Float64
 
 _REACH = 0.85  # of a square: how far from its corner the pattern is compared; beyond 1 the next edges come
-_MOST_STEPS = 12  # from a corner to the end of its reach, a pixel each where that is enough
+_MOST_STEPS = 25  # from a corner to the end of its reach, a pixel each where that is enough
+_FEW_STEPS = 8  # as many, while the width of the edges is looked for
 _BLURS_PX = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # an edge's standard deviations that are tried
 _ROUNDS = 8
 _SETTLED_PX = 1e-3
@@ -20,7 +21,7 @@ _LEAST_NOISE = 0.005  # of the contrast: what rounding and saturation hide is th
 _INSIDE = 0.35  # of half a square's diagonal: how far from its middle a square's noise is measured
 
 
-def refine(grey: Float32, rough: Float64, size: tuple[int, int]) -> Float64:
+def refine(grey: Float32, rough: Float64, size: tuple[int, int], *, quick: bool = False) -> Float64:
     """Returns the corners (n, 2) where a pattern of two crossing edges fits the image best; NaN where none.
 
     The pattern is an ideal corner seen through a blurred lens, `m + c · erf(s) · erf(t)`, over most of
@@ -34,6 +35,7 @@ def refine(grey: Float32, rough: Float64, size: tuple[int, int]) -> Float64:
         grey: (h, w).
         rough: (rows · columns, 2) px, to about a third of a square.
         size: Columns and rows.
+        quick: Coarser, for a live view.
     """
     start = _towards_plane(rough, size)
     noise = _Noise.of(grey, start.reshape(size[1], size[0], 2))
@@ -41,13 +43,14 @@ def refine(grey: Float32, rough: Float64, size: tuple[int, int]) -> Float64:
     side = np.minimum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
     widest = max(float(np.median(side)) / 5, _BLURS_PX[0])
     corners, fits = start, []
-    blurs = [blur for blur in _BLURS_PX if blur <= widest]
+    blurs = [blur for blur in _BLURS_PX[:: 3 if quick else 1] if blur <= widest]
     for blur in (blurs[-1], *blurs):  # the widest reaches farthest; from there on, the narrowest first
-        corners, misfit = _fit(grey, corners, along, down, blur, noise)
-        fits.append((misfit, corners))
+        corners, misfit = _fit(grey, corners, along, down, blur, noise, _FEW_STEPS)
+        fits.append((misfit, blur, corners))
         if len(fits) > 3 and fits[-1][0] > fits[-2][0]:
             break  # wider ones fit worse and worse
-    best = min(fits, key=lambda fit: fit[0])[1]
+    _, blur, corners = min(fits[1:], key=lambda fit: fit[0])
+    best = corners if quick else _fit(grey, corners, along, down, blur, noise, _MOST_STEPS)[0]
     away = np.linalg.norm(best - start, axis=1)
     return np.where((away < _MOST_SHIFT * side)[:, None], best, np.nan)
 
@@ -113,11 +116,17 @@ def _sides(corners: Float64, size: tuple[int, int]) -> tuple[Float64, Float64]:
 
 
 def _fit(
-    image: Float32, corners: Float64, along: Float64, down: Float64, blur_px: float, noise: _Noise
+    image: Float32,
+    corners: Float64,
+    along: Float64,
+    down: Float64,
+    blur_px: float,
+    noise: _Noise,
+    most_steps: int,
 ) -> tuple[Float64, float]:
     """The corners that fit best with edges of one width, and minus twice the log-likelihood of a pixel."""
     lengths = np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1)
-    steps = int(np.clip(np.ceil(_REACH * max(map(np.median, lengths))), 4, _MOST_STEPS))
+    steps = int(np.clip(np.ceil(_REACH * max(map(np.median, lengths))), 4, most_steps))
     t, s = _REACH * (np.mgrid[: 2 * steps + 1, : 2 * steps + 1].reshape(2, -1) / steps - 1)
     grid = s[:, None] * along[:, None] + t[:, None] * down[:, None]  # (n, k, 2) px
     (es, ds), (et, dt) = (_edge(p, length, blur_px) for p, length in zip((s, t), lengths, strict=True))
