@@ -72,7 +72,7 @@ def calibrate(source: Source, options: Options, gates: LimitsGates, note: Note) 
     if options.model is not None:
         model = Model.from_bytes(read_file(options.model, "model"), str(options.model))
     windows = windows_of(source, model, options.window_px, options.place_px, options.seed, note)
-    _spans_enough(windows, gates)
+    check_span(windows, gates)
     classes, rig = source.classes, source.rig.whole()
     if classes is None:  # windows_of has refused
         raise RefusedError(f"{source.path}: has no classes.toml")
@@ -120,8 +120,8 @@ def calibrate(source: Source, options: Options, gates: LimitsGates, note: Note) 
     )
 
 
-def _spans_enough(windows: Windows, gates: LimitsGates) -> None:
-    """Refuses captures from which limits cannot be told, saying which are missing."""
+def check_span(windows: Windows, gates: LimitsGates) -> None:
+    """Raises RefusedError where limits cannot be told from the captures, saying which are missing."""
     reasons = []
     captures = len(np.unique(windows.capture))
     if captures < gates.captures:

@@ -17,7 +17,9 @@ NAMES = ("near_m", "far_m", "slope_per_m", "angle_rad", "slope_per_rad", "platea
 
 LEAST_GAP_M = 0.03
 """Between the near and the far limit."""
-_MARGIN_M, _MARGIN_RAD = 0.05, np.radians(5.0)  # how far beyond the data a limit may lie
+# How far beyond the data a limit may lie. Near, the sensor ends soon anyway; and as both limits have one
+# slope, a soft far one needs room there, or it would cut what was seen to be right.
+_MARGIN_NEAR_M, _MARGIN_FAR_M, _MARGIN_RAD = 0.15, 0.05, np.radians(5.0)
 _SLOPES = (np.log([3.0, 500.0]), np.log([3.0, 200.0]))  # per metre and per radian
 _SLOPE_PRIOR = (np.log(40.0), np.log(20.0), 1.0)  # 10 to 90 % within 0.11 m and 13°; standard deviation
 _PLATEAU_PRIOR = (1.0, 1.5)  # logit and standard deviation
@@ -114,27 +116,38 @@ def pooled_prior(pooled: Fit, span: Span) -> Prior:
     return Prior(np.asarray(pooled.x), sd)
 
 
-def fit(cells: Cells, prior: Prior, span: Span, chance: float, start: Float64 | None = None) -> Fit:
+def fit(cells: Cells, prior: Prior, span: Span, chance: float, around: Fit | None = None) -> Fit:
     """Returns the most probable parameters.
 
     The model is `chance + (plateau − chance) · P`, P being the probability map's product of sigmoids: a
-    window that is seen badly is still right by chance, and even the best are not always right. Counts of
-    one capture scatter more than independent windows; the likelihood is divided by that (McCullagh and
-    Nelder 1989, ch. 4.5), so that the prior keeps its share. The prior keeps every number finite where the
-    data are separable, and no limit goes farther beyond the data than a margin.
+    window that is seen badly is still right by chance, and even the best are not always right. Windows of
+    one capture resemble each other; the likelihood is divided by how much more captures scatter than
+    independent windows would (McCullagh and Nelder 1989, ch. 4.5), so that the prior keeps its share. The
+    prior keeps every number finite where the data are separable, and no limit goes farther beyond the data
+    than a margin.
 
     Args:
         cells: The counts.
         prior: See `weak_prior` and `pooled_prior`.
         span: What was seen; limits stay within it and a margin.
         chance: Share that is right where texture says nothing.
-        start: (6,) where to begin; None: the best of a grid.
+        around: A fit to much the same cells, whose dispersion is taken and where the search begins; None: the
+            best of a grid.
     """
-    first = _maximised(cells, prior, span, chance, start, 1.0)
+    if around is not None:
+        return replace(around, x=_maximised(cells, prior, span, chance, around.x, around.dispersion))
+    first = _maximised(cells, prior, span, chance, None, 1.0)
     p = _model(first, cells.distance_m, cells.angle_rad, chance)[0]
-    misfit = float(((cells.right - cells.total * p) ** 2 / (cells.total * p * (1 - p))).sum())
-    dispersion = max(1.0, misfit / max(1, len(cells.total) - len(NAMES)))
+    dispersion = _dispersion(cells, p)
     return Fit(_maximised(cells, prior, span, chance, first, dispersion), chance, dispersion)
+
+
+def _dispersion(cells: Cells, p: Float64) -> float:
+    """By how much whole captures miss their expected counts more than independent windows would."""
+    _, capture = np.unique(cells.capture, return_inverse=True)
+    missed = np.bincount(capture, cells.right - cells.total * p)
+    expected = np.bincount(capture, cells.total * p * (1 - p))
+    return max(1.0, float((missed**2 / expected).sum() / max(1, len(missed) - len(NAMES))))
 
 
 def fit_plateau(cells: Cells, limits: TextureLimits, chance: float) -> Fit:
@@ -168,8 +181,8 @@ def bounds_of(span: Span) -> Float64:
     low, high = span.distance_m
     return np.array(
         [
-            [max(0.0, low - _MARGIN_M), high],
-            [low, high + _MARGIN_M],
+            [max(0.0, low - _MARGIN_NEAR_M), high],
+            [low, high + _MARGIN_FAR_M],
             _SLOPES[0],
             [np.radians(2.0), min(np.pi / 2, span.angle_rad[1] + _MARGIN_RAD)],
             _SLOPES[1],

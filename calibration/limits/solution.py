@@ -12,7 +12,6 @@ from calibration.limits.likelihood import (
     Fit,
     Prior,
     Span,
-    bounds_of,
     fit,
     fit_plateau,
     log_likelihood,
@@ -26,7 +25,7 @@ from surfclass.types import Float64
 
 _FEWEST_WINDOWS, _FEWEST_CAPTURES = 30, 3
 _MOST_FOLDS = 10
-_AT_THE_END = 0.02  # m and rad: a limit so near its bound is where the data end, not where texture does
+_AT_THE_END = 0.005  # m and rad: a limit there or beyond is where the data end, not where texture does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +131,7 @@ def _tells(cells: Cells) -> bool:
 
 
 def _again(cells: Cells, prior: Prior, span: Span, around: Fit) -> Float64:
-    return _natural(fit(cells, prior, span, around.chance, around.x))
+    return _natural(fit(cells, prior, span, around.chance, around))
 
 
 def _natural(found: Fit) -> Float64:
@@ -144,12 +143,12 @@ def _natural(found: Fit) -> Float64:
 
 def _described(found: Fit, draws: list[Float64], span: Span, cells: Cells) -> ClassLimits:
     sd = np.std(np.array(draws), axis=0, ddof=1) if len(draws) > 1 else np.full(len(NAMES), np.nan)
-    bounds = bounds_of(span)
-    ends = tuple(
-        NAMES[place]
-        for place, side in ((0, 0), (1, 1), (3, 1))
-        if abs(found.x[place] - bounds[place, side]) < _AT_THE_END
-    )
+    beyond = {
+        "near_m": found.x[0] < span.distance_m[0] + _AT_THE_END,
+        "far_m": found.x[1] > span.distance_m[1] - _AT_THE_END,
+        "angle_rad": found.x[3] > span.angle_rad[1] - _AT_THE_END,
+    }
+    ends = tuple(name for name, there in beyond.items() if there)
     captures = len(np.unique(cells.capture))
     return ClassLimits(found, sd, span, round(float(cells.total.sum())), captures, ends)
 
