@@ -122,22 +122,22 @@ def limits_of_use(
         classifier: "svm" or "naive_bayes".
         exposure_s: Of the training captures.
     """
-    said, seen = [], dict[str, list[str]]()
-    for route, card in cards.items():
-        distance, angle = card.told["distance_m"], card.told["angle_rad"]
-        if distance is not None and angle is not None:
-            seen.setdefault(
-                f"trained from {distance[0]:.2f} to {distance[1]:.2f} m and {np.degrees(angle[0]):.0f} to "
-                f"{np.degrees(angle[1]):.0f}°; the figures hold there, `evaluate` on `test` captures "
-                "says what holds elsewhere",
-                [],
-            ).append(route)
-        if card.told["held_out_by"] == "sample":
-            said.append(
-                f"{route}: a class has one place only, so samples of the same place were held out: accuracy "
-                "and confidence are too good"
-            )
-    said = [f"{', '.join(routes)}: {sentence}" for sentence, routes in seen.items()] + said
+    said = []
+    seen = [card.told for card in cards.values() if card.told["distance_m"] and card.told["angle_rad"]]
+    if seen:
+        near, far = (end([told["distance_m"][i] for told in seen]) for i, end in ((0, min), (1, max)))
+        direct, oblique = (end([told["angle_rad"][i] for told in seen]) for i, end in ((0, min), (1, max)))
+        said.append(
+            f"trained from {near:.2f} to {far:.2f} m and {np.degrees(direct):.0f} to "
+            f"{np.degrees(oblique):.0f}°: the figures hold there; what holds elsewhere `evaluate` says, on "
+            "labelled `test` captures"
+        )
+    said += [
+        f"{route}: a class has one place only, so samples of the same place were held out: accuracy and "
+        "confidence are too good"
+        for route, card in cards.items()
+        if card.told["held_out_by"] == "sample"
+    ]
     if classifier == "svm":
         said.append("a surface that was never trained on is named as the class that it resembles most")
     if reflectance == "thesis":
