@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.light.samples import board_plane, on_board
+from calibration.light.samples import board_plane, on_board, on_plane
 from calibration.source import Source
 from surfclass.colour import as_fraction
+from surfclass.frames import Capture
+from surfclass.geometry import rays
 from surfclass.pipeline import lit_image
 from surfclass.reflectance import diffuse_reflectance
 from surfclass.rig import Rig
 from surfclass.routes import ReflectanceMode
-from surfclass.types import Float64
+from surfclass.types import Float64, SurfaceView
 from surfclass.viewing import view_surface
 
 
@@ -38,7 +40,8 @@ def k_d_variation(
 ) -> tuple[Float64, dict[str, float]] | None:
     """Returns the variation of K_d over all pixels of these captures together, and of each by itself.
 
-    Every pixel that the reflectance model holds valid counts, with its noise and its own normal.
+    Every pixel of the card that the reflectance model holds valid counts, with its noise. The card is flat:
+    its plane gives every pixel's normal, so that the noise of single normals is not put down to the light.
 
     Args:
         source: Holds the `response` captures.
@@ -61,11 +64,10 @@ def k_d_variation(
         ratio = reference_s / exposure_s if reference_s and exposure_s else 1.0
         if mode == "thesis" and abs(ratio - 1) > 0.01:
             continue
-        view, image = view_surface(capture.depth.depth_mm, rig), lit_image(capture, rig)
+        view, image = _flat(capture, rig), lit_image(capture, rig)
         values, valid = diffuse_reflectance(
             as_fraction(image), view, rig, mode, ratio, 8 * image.dtype.itemsize
         )
-        valid = valid & on_board(capture, rig, board_plane(capture, rig))
         kept = values[:, valid].astype(np.float64)
         kept = np.concatenate([kept, kept.mean(axis=0, keepdims=True)])
         if not kept.size:
@@ -76,3 +78,25 @@ def k_d_variation(
         whole.total = whole.total + one.total
         whole.square = whole.square + one.square
     return (whole.variation, each) if whole.count else None
+
+
+def _flat(capture: Capture, rig: Rig) -> SurfaceView:
+    """The view of a card, with its plane's points and normal at all of its pixels."""
+    plane = board_plane(capture, rig)
+    card = on_board(capture, rig, plane)
+    view = view_surface(capture.depth.depth_mm, rig)
+    height, width = card.shape
+    point = on_plane(rays(rig.rgb).reshape(2, -1).T.astype(np.float64), plane).T.reshape(3, height, width)
+    away = np.array(rig.light.position_rgb_m if rig.light else (0.0, 0.0, 0.0))[:, None, None] - point
+    distance = np.linalg.norm(away, axis=0)
+    cosine = np.tensordot(plane.normal, away, axes=1) / distance
+    normal = np.broadcast_to(plane.normal[:, None, None], point.shape)
+    return replace(
+        view,
+        point=(point * card).astype(np.float32),
+        normal=(normal * card).astype(np.float32),
+        light_distance_m=(distance * card).astype(np.float32),
+        light_cosine=(cosine * card).astype(np.float32),
+        has_point=card,
+        has_normal=card,
+    )
