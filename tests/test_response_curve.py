@@ -94,8 +94,8 @@ def test_spread_over_seeds_is_what_the_jackknife_says():
     sampled = np.sqrt(np.mean(np.var(logs, axis=0, ddof=1)))
     predicted = np.sqrt(np.mean([world.relative_sd[1, 60:240] ** 2 for world in worlds]))
     assert 1 / 6 < sampled / predicted < 1.5  # leaving out an end's exposure costs more than its noise
-    true = np.log(inverse_of(srgb)[0])
-    bias = np.mean(logs, axis=0) - (true[60:240] - true[middle])
+    true = inverse_of(srgb)[0]
+    bias = np.mean(logs, axis=0) - np.log(true[60:240] / true[middle])
     assert np.ptp(bias) < 0.004
 
 
