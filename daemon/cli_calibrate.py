@@ -169,6 +169,14 @@ def hand_eye(
     )
 
 
+class Series(StrEnum):
+    """What the response is found from."""
+
+    auto = "auto"
+    exposure = "exposure"
+    distance = "distance"
+
+
 @calibrate.command()
 def response(
     from_: FromOption = None,
@@ -180,6 +188,12 @@ def response(
     new_devices: NewDevicesOption = False,
     page: PageOption = True,
     idle_s: IdleOption = 900.0,
+    series: Annotated[
+        Series, typer.Option(help="Exposures, or distances (weak); auto: exposures if there are any.")
+    ] = Series.auto,
+    thesis: Annotated[
+        bool, typer.Option("--thesis", help="Only the distance polynomial of Eq. 4.4.")
+    ] = False,
 ) -> None:
     """How the colour camera turns light into numbers, its dark level and its noise."""
     from daemon import commissioning_steps
@@ -187,7 +201,7 @@ def response(
     call = commissioning_steps.call(
         "response", config, set_, from_, calibration, json_, pictures, new_devices, page, idle_s
     )
-    raise typer.Exit(commissioning_steps.response(call))
+    raise typer.Exit(commissioning_steps.response(call, series.value, thesis))
 
 
 class Use(StrEnum):

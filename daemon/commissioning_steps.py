@@ -207,19 +207,23 @@ def spheres(call: Call, options: SpheresOptions) -> int:
     return commission(replace(alone, options=options_told, files=files), solve)
 
 
-def response(call: Call) -> int:
+def response(
+    call: Call, series: Literal["auto", "exposure", "distance"] = "auto", thesis: bool = False
+) -> int:
     """Runs `calibrate response` and returns the exit code."""
     from calibration.response.command import Options, calibrate
     from calibration.response.guide import ResponseGuide
 
+    options = Options(source=series, thesis=thesis)
+
     def solve(source: Given, gates: Gates, note: Note) -> Outcome:
         assert isinstance(source, Source)  # there are captures, or the call has failed
-        return calibrate(source, Options(), gates.response, note)
+        return calibrate(source, options, gates.response, note)
 
     def targets(config: Config, rig: DepthRig) -> tuple[Sequence[Wanted], Texts]:
-        return [Wanted(ResponseGuide(rig, "exposure"))], Texts()
+        return [Wanted(ResponseGuide(rig, "distance" if series == "distance" else "exposure"))], Texts()
 
-    return commission(call, solve, targets)
+    return commission(replace(call, options=asdict(options)), solve, targets)
 
 
 def verify(
