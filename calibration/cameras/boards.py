@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.detection import find_checkerboard, grey_image, stretched
+from calibration.cameras.detection import find_checkerboard, grey_image, rough_size, stretched
 from calibration.cameras.refinement import refine
 from drivers.recordings.board import Board
 from surfclass.errors import ConfigurationError
 from surfclass.types import Float32, Float64
 
-__all__ = ["Board", "Found", "find_board"]
+__all__ = ["Board", "Found", "find_board", "size_seen", "symmetries"]
 
 _LEAST_CORNERS = 6
-_LEAST_PLACED = 0.5  # of a checkerboard's corners
+_LEAST_PLACED = 0.93  # of a checkerboard's corners; a whole row that is none is another board
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +61,18 @@ def find_board(image: NDArray[Any], board: Board, *, quick: bool = False) -> Fou
     if placed.mean() < _LEAST_PLACED:
         return None
     return Found(corners[placed], np.flatnonzero(placed))
+
+
+def size_seen(image: NDArray[Any]) -> tuple[int, int] | None:
+    """Returns columns and rows of inner corners of whatever checkerboard an image shows, or None."""
+    rough = rough_size(grey_image(image))
+    if rough is None:
+        return None
+    columns, rows = rough
+    for size in ((columns, rows), (columns - 1, rows), (columns, rows - 1), (columns - 1, rows - 1)):
+        if min(size) >= 3 and find_board(image, Board(columns=size[0], rows=size[1], square_m=1.0)):
+            return max(size), min(size)
+    return None
 
 
 def symmetries(board: Board) -> list[NDArray[np.int64]]:

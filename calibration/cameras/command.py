@@ -89,7 +89,7 @@ def calibrate(source: Source | ImagePairs, options: Options, gates: CamerasGates
     observations = observations_of(views.views, board, views.sizes)
     missing = faults(observations)
     if missing:
-        raise RefusedError(*missing)
+        raise RefusedError(*missing, *([views.other_board] if views.other_board else []))
     note("adjusting")
     solution = solve(observations, board, options.order, _fixed(source, options))
     cameras = _cameras(solution)

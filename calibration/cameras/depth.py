@@ -21,7 +21,8 @@ _LEAST_FILLED = 0.5  # of a block's pixels that have a reading
 _INSET = 0.4  # of a square: how far inside of the outermost squares' outer edges readings count
 _COUNTS = (1, 3, 6, 10)  # coefficients of orders 0 to 3
 _GAIN = 0.02  # share of the held-out rms by which a larger model must be better
-_NEEDED_GAIN = 0.05  # the same, against no correction
+_NEEDED_GAIN = 0.05  # the same, against no correction …
+_NEEDED = 1e-3  # … and what is corrected must be more than this, relative: a millimetre at 1 m
 _ROUNDS = 5
 _HUBER = 2.0
 
@@ -133,7 +134,7 @@ def fit_depth(readings: Sequence[DepthReadings]) -> DepthFit:
     sd = np.sqrt(np.diag(jackknife_covariance(left)))[: count + offset]
     return DepthFit(
         DepthCorrection(multiplier=tuple(whole[:count].tolist()), inverse_offset_per_m=float(whole[count])),
-        scores[pick] < (1 - _NEEDED_GAIN) * plain,
+        scores[pick] < (1 - _NEEDED_GAIN) * plain and plain**2 - scores[pick] ** 2 > _NEEDED**2,
         tuple(sd.tolist()),
         scale,
         plain,

@@ -52,13 +52,15 @@ def find_checkerboard(grey: Float32, size: tuple[int, int], *, quick: bool = Fal
     return None
 
 
-def size_seen(grey: Float32) -> tuple[int, int] | None:
-    """Returns columns and rows of inner corners of whatever checkerboard is in sight, or None."""
+def rough_size(grey: Float32) -> tuple[int, int] | None:
+    """Returns columns and rows of inner corners of whatever checkerboard is in sight, or None.
+
+    It may be one too many: something beside the board may look like one more row.
+    """
     for attempt, _ in _attempts(grey, quick=False):
         found, _, cells = cv2.findChessboardCornersSBWithMeta(attempt, (3, 3), cv2.CALIB_CB_LARGER)
         if found and cells is not None and min(cells.shape[:2]) >= 3:
-            rows, columns = cells.shape[:2]
-            return max(rows, columns), min(rows, columns)
+            return int(cells.shape[1]), int(cells.shape[0])
     return None
 
 

@@ -108,7 +108,8 @@ class CamerasGuide:
         size = self._board.columns, self._board.rows
         corners = seen.corners.astype(np.float32).reshape(-1, 1, 2)
         grey = stretched(grey_image(images["rgb"]))
-        width = float(cv2.estimateChessboardSharpness(grey, size, corners)[0][0])
+        figures, _ = cv2.estimateChessboardSharpness(grey, size, corners)
+        width = float(np.ravel(figures)[0])
         grid = seen.corners.reshape(size[1], size[0], 2)
         side = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
         if width <= max(_WIDEST_EDGE * side, 3.0):

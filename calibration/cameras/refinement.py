@@ -18,6 +18,7 @@ _SETTLED_PX = 1e-3
 _MOST_STEP = 0.2  # of a square, at once
 _MOST_SHIFT = 0.45  # of a square: a corner that moves farther is not this corner
 _LEAST_NOISE = 0.005  # of the contrast: what rounding and saturation hide is there still
+_LEAST_CONTRAST = 0.6  # of the median corner's: at the board's outer edge it is about a third
 _INSIDE = 0.35  # of half a square's diagonal: how far from its middle a square's noise is measured
 
 
@@ -45,14 +46,16 @@ def refine(grey: Float32, rough: Float64, size: tuple[int, int], *, quick: bool 
     corners, fits = start, []
     blurs = [blur for blur in _BLURS_PX[:: 3 if quick else 1] if blur <= widest]
     for blur in (blurs[-1], *blurs):  # the widest reaches farthest; from there on, the narrowest first
-        corners, misfit = _fit(grey, corners, along, down, blur, noise, _FEW_STEPS)
-        fits.append((misfit, blur, corners))
+        fit = _fit(grey, corners, along, down, blur, noise, _FEW_STEPS)
+        corners = fit[0]
+        fits.append((fit[2], blur, fit))
         if len(fits) > 3 and fits[-1][0] > fits[-2][0]:
             break  # wider ones fit worse and worse
-    _, blur, corners = min(fits[1:], key=lambda fit: fit[0])
-    best = corners if quick else _fit(grey, corners, along, down, blur, noise, _MOST_STEPS)[0]
+    _, blur, fit = min(fits[1:], key=lambda one: one[0])
+    best, contrast, _ = fit if quick else _fit(grey, fit[0], along, down, blur, noise, _MOST_STEPS)
+    crossing = contrast > _LEAST_CONTRAST * np.median(contrast)
     away = np.linalg.norm(best - start, axis=1)
-    return np.where((away < _MOST_SHIFT * side)[:, None], best, np.nan)
+    return np.where((crossing & (away < _MOST_SHIFT * side))[:, None], best, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +126,12 @@ def _fit(
     blur_px: float,
     noise: _Noise,
     most_steps: int,
-) -> tuple[Float64, float]:
-    """The corners that fit best with edges of one width, and minus twice the log-likelihood of a pixel."""
+) -> tuple[Float64, Float64, float]:
+    """The corners that fit best with edges of one width.
+
+    Returns:
+        (n, 2) px; (n,) the contrast over the brightness; and minus twice the log-likelihood of a pixel.
+    """
     lengths = np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1)
     steps = int(np.clip(np.ceil(_REACH * max(map(np.median, lengths))), 4, most_steps))
     t, s = _REACH * (np.mgrid[: 2 * steps + 1, : 2 * steps + 1].reshape(2, -1) / steps - 1)
@@ -150,7 +157,7 @@ def _fit(
         misfit = float(np.median(np.mean((value - model) ** 2 * weight + 2 * np.log(spread), axis=1)))
         if np.abs(step).max() < _SETTLED_PX:
             break
-    return found, misfit
+    return found, np.abs(x[:, 3]) / np.maximum(x[:, 0], 1e-9), misfit
 
 
 def _edge(place: Float64, length_px: Float64, blur_px: float) -> tuple[Float64, Float64]:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.boards import Board, find_board
-from calibration.cameras.detection import grey_image, size_seen
+from calibration.cameras.boards import Board, find_board, size_seen
 from calibration.cameras.observations import View
 from calibration.cameras.pairs import ImagePairs
 from calibration.outcome import Note, RefusedError
@@ -26,12 +25,14 @@ class Views:
         sizes: (width, height) of the cameras' images, px; the first camera is the reference.
         missed: For each camera the names of the views in which the board was not found.
         depth_mm: Depth images by view, of those that have one.
+        other_board: Where most images do not show the board as told: which one they show, a sentence.
     """
 
     views: tuple[View, ...]
     sizes: Mapping[str, tuple[int, int]]
     missed: Mapping[str, tuple[str, ...]]
     depth_mm: Mapping[str, NDArray[np.uint16]]
+    other_board: str | None
 
 
 def read_views(source: Source | ImagePairs, board: Board, note: Note) -> Views:
@@ -60,9 +61,18 @@ def read_views(source: Source | ImagePairs, board: Board, note: Note) -> Views:
         note(f"{name}: board in {' and '.join(found) or 'no image'}")
     order = source.cameras if isinstance(source, ImagePairs) else ("depth", "rgb")
     seen = {camera: sizes[camera] for camera in order if any(camera in view.found for view in views)}
+    other = None
+    if last is not None and sum(map(len, missed.values())) > sum(len(view.found) for view in views):
+        other = _other_board(board, last)
     if not seen:
-        raise RefusedError(_nothing_found(len(views), board, last))
-    return Views(tuple(views), seen, {camera: tuple(names) for camera, names in missed.items()}, depth)
+        if last is None:
+            raise RefusedError(
+                "there are no images of a board (captures of the role board with IR or colour): capture a "
+                "board from 12 or more directions"
+            )
+        whole = "it has to be whole in the image, lit evenly and sharp"
+        raise RefusedError(f"the {board} is in none of {len(views)} views; {other or whole}")
+    return Views(tuple(views), seen, {camera: tuple(names) for camera, names in missed.items()}, depth, other)
 
 
 def _images(
@@ -81,17 +91,11 @@ def _images(
         )
 
 
-def _nothing_found(count: int, board: Board, image: NDArray[Any] | None) -> str:
-    if image is None:
-        return (
-            f"there are no images of a board (captures of the role board: {count}): capture "
-            "a board from 12 or more directions, with the IR image"
-        )
-    said = f"the {board} is in none of {count} views"
-    seen = size_seen(grey_image(image)) if board.kind == "checkerboard" else None
-    if seen is not None and set(seen) != {board.columns, board.rows}:
-        return (
-            f"{said}, but one of {seen[0]} × {seen[1]} inner corners is: count the corners where "
-            f"four squares meet, and say --board {seen[0]}x{seen[1]}"
-        )
-    return f"{said}: it has to be whole in the image, lit evenly and sharp"
+def _other_board(board: Board, image: NDArray[Any]) -> str | None:
+    size = size_seen(image) if board.kind == "checkerboard" else None
+    if size is None or set(size) == {board.columns, board.rows}:
+        return None
+    return (
+        f"there is a checkerboard of {size[0]} × {size[1]} inner corners instead: count the corners where "
+        f"four squares meet, and say --board {size[0]}x{size[1]}"
+    )
