@@ -119,6 +119,7 @@ def _checkerboard() -> Scene:
     # Chosen for what they tell of both cameras and of where they are to each other: near and tilted, all
     # round the image and turned about the line of sight; a few fill the depth camera's image alone.
     places = (
+        (0.00, 0.69, 0.62, 0, 0, -6),
         (-0.05, 0.65, 0.50, 22, -17, 0), (-0.01, 0.64, 0.40, 1, -33, 0), (0.12, 0.86, 0.80, 18, -17, -90),
         (0.07, 0.51, 0.45, -18, 17, 180), (-0.18, 0.52, 0.80, 11, -16, 0), (0.02, 0.81, 0.60, 4, 7, 90),
         (0.05, 0.69, 0.50, -21, -6, 0), (-0.02, 0.72, 0.50, -21, 0, 90), (0.02, 0.79, 0.50, 6, 19, -90),
@@ -128,7 +129,7 @@ def _checkerboard() -> Scene:
         (-0.12, 0.42, 0.90, -13, 31, 90), (0.04, 0.79, 0.38, -12, -1, 0),
     )  # fmt: skip
     looks = tuple(
-        Look(f"view_{index:02d}", (x, y, z), distance, turn, rise, roll)
+        Look(f"tilt_{index:02d}", (x, y, z), distance, turn, rise, roll)
         for index, (y, z, distance, turn, rise, roll) in enumerate(places)
     )
     return Scene("checkerboard", (*box(board, 0.004, ("white",)), wall()), looks)
