@@ -63,7 +63,12 @@ def import_folder(directory: Path, out: Path) -> int:
     folder = read_folder(directory)
     source = directory.resolve().name  # "." has none
     writer = RecordingWriter(
-        out, folder.rig_text, folder.classes_text, {"source": source}, plate_text=folder.plate_text
+        out,
+        folder.rig_text,
+        folder.classes_text,
+        {"source": source},
+        plate_text=folder.plate_text,
+        board_text=folder.board_text,
     )
     try:
         with progress(len(folder), "importing") as advance:

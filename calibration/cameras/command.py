@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from calibration.cameras.adjustment import rms_px
 from calibration.cameras.boards import Board
 from calibration.cameras.conditions import coverage, faults, square_fault, tilts_deg
 from calibration.cameras.depth import DepthFit, DepthReadings, fit_depth, read_plane
+from calibration.cameras.detection import grey_image, rough_size
 from calibration.cameras.observations import observations_of
 from calibration.cameras.pairs import ImagePairs
 from calibration.cameras.report import figures, pictures
@@ -28,6 +31,8 @@ from surfclass.rig import Camera
 from surfclass.types import Float64
 
 _LEAST_DEPTH_VIEWS = 4
+_LOOKS = 6  # image pairs, for a board that was not told
+_ASSUMED_SQUARE_M = 0.025
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +89,7 @@ def calibrate(source: Source | ImagePairs, options: Options, gates: CamerasGates
             have another size than told.
         ConfigurationError: If no board is told, or an option does not fit.
     """
-    board = _board(source, options)
+    board = _board(source, options, note)
     views = read_views(source, board, note)
     observations = observations_of(views.views, board, views.sizes)
     missing = faults(observations)
@@ -131,8 +136,8 @@ def calibrate(source: Source | ImagePairs, options: Options, gates: CamerasGates
     )
 
 
-def _board(source: Source | ImagePairs, options: Options) -> Board:
-    board = options.board or (None if isinstance(source, ImagePairs) else source.board)
+def _board(source: Source | ImagePairs, options: Options, note: Note) -> Board:
+    board = options.board or (_seen_board(source, note) if isinstance(source, ImagePairs) else source.board)
     if board is None:
         raise ConfigurationError(
             f"{source.path}: which board? It has no board.toml: give --board 9x6 --square-mm 25 "
@@ -140,6 +145,20 @@ def _board(source: Source | ImagePairs, options: Options) -> Board:
         )
     if options.order is not None and options.order not in ORDERS:
         raise ConfigurationError(f"distortion model {options.order}, allowed: {', '.join(map(str, ORDERS))}")
+    return board
+
+
+def _seen_board(source: ImagePairs, note: Note) -> Board | None:
+    """The checkerboard that most of the first images show; of its squares' size only lengths depend."""
+    seen: Counter[tuple[int, int]] = Counter()
+    for _, images in islice(source.images(), _LOOKS):
+        sizes = [rough_size(grey_image(image)) for image in images.values()]
+        seen.update(size for size in sizes if size is not None)
+    if not seen:
+        return None
+    columns, rows = seen.most_common(1)[0][0]
+    board = Board(columns=columns, rows=rows, square_m=_ASSUMED_SQUARE_M)
+    note(f"no board was told: {board}, as most images show; the size of the squares is assumed")
     return board
 
 

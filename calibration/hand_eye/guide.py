@@ -18,6 +18,7 @@ from calibration.rotations import rotation_vector
 from drivers.recordings.board import Board
 from drivers.recordings.plate import Plate
 from surfclass.frames import Capture
+from surfclass.geometry import corrected_depth
 from surfclass.kinematics import flange_pose
 from surfclass.rig import DepthRig
 from surfclass.types import Float64
@@ -138,7 +139,12 @@ class HandEyeGuide:
                 none = f"the {self._target} is not found: bring all of it into the image, without glare"
                 return _Target(np.zeros((0, 2)), (none,))
             return _Target(board.corners, _at_border(board.corners, image.shape))
-        sighting = look_for_discs(capture.depth, self._rig.depth, self._target.disc_radius_m)
+        sighting = look_for_discs(
+            capture.depth,
+            self._rig.depth,
+            self._target.disc_radius_m,
+            corrected_depth(capture.depth.depth_mm, self._rig),
+        )
         points = np.array([disc.pixel for disc in sighting.discs]).reshape(-1, 2)
         all_ = len(self._target.positions_base_m)
         if len(points) < _WHOLE * all_:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from surfclass.errors import InputError
 from surfclass.frames import Capture
-from surfclass.geometry import depth_to_points, fit_plane, rays, register
+from surfclass.geometry import corrected_depth, depth_to_points, fit_plane, rays, register
 from surfclass.reflectance import OVER_EXPOSED, least_fraction
 from surfclass.rig import Rig
 from surfclass.types import Bool, Float64
@@ -103,7 +103,7 @@ def board_plane(capture: Capture, rig: Rig) -> Plane:
     Raises:
         InputError: If there is no plane that a fifth of the readings lie on.
     """
-    points = depth_to_points(capture.depth.depth_mm, rig.depth).reshape(3, -1)
+    points = depth_to_points(corrected_depth(capture.depth.depth_mm, rig), rig.depth).reshape(3, -1)
     seen = points[:, points[2] > 0]
     if seen.shape[1] < 1000:
         raise InputError(f"capture {capture.name}: only {seen.shape[1]} depth readings, needed are 1000")
