@@ -80,7 +80,8 @@ class TestReplay:
             found = {name: arrays[name] for name in arrays.files}
         n, k = len(found["index"]), len(CLASSES)
         assert set(found) == {
-            "voxel_size_m", "classes", "colours", "index", "p_colour", "p_texture", "p", "weight", "count"
+            "voxel_size_m", "classes", "colours", "index", "p_colour", "p_texture", "p", "weight", "count",
+            "made_with",
         }  # fmt: skip
         assert n > 1000
         assert found["voxel_size_m"] == 0.010

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import importlib.metadata
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,6 +15,7 @@ from calibration.training.card import RouteCard, assess, limits_of_use
 from calibration.training.pictures import draw_confusions, draw_features, draw_reliability
 from surfclass import reflectance
 from surfclass.errors import InputError
+from surfclass.fingerprint import fingerprints
 from surfclass.model import Model
 from surfclass.training import Trained, TrainingSettings, train_checked
 
@@ -104,10 +104,10 @@ def _card(source: Source, trained: Trained, cards: dict[str, RouteCard]) -> dict
     own = trained.model.card
     return {
         **own,
-        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "version": importlib.metadata.version("surfclass"),
         "source": source.path.name,
         "sha256": source.digests(),
+        "made_with": fingerprints(trained.model.complete(source.rig.whole())),
         "rig_values": trained.model.rig_values,
         "routes": {route: card.told for route, card in cards.items()},
         "limits_of_use": limits_of_use(
