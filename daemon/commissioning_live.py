@@ -14,7 +14,7 @@ from types import FrameType
 
 from calibration.guide import Guide
 from calibration.live.devices import device_metadata
-from calibration.live.loop import GuidedSettings, guided_all
+from calibration.live.loop import CaptureAbortedError, GuidedSettings, guided_all
 from calibration.live.page import PageUi
 from calibration.live.terminal import TerminalUi
 from calibration.live.ui import ScopedUi, Several
@@ -81,7 +81,7 @@ def record(
 
     Raises:
         DriverError, CaptureRejectedError: As the devices do; what was accepted is a finished recording.
-        CaptureAbortedError: If the person or a signal ended it; nothing is kept then.
+        SystemExit: If the person (1) or a signal (128 + its number) ended it; nothing is kept then.
         ConfigurationError: If there are no devices, or the configuration has no place for results.
         InputError: If nothing was accepted.
     """
@@ -106,15 +106,13 @@ def record(
             plate_text=texts.plate,
             board_text=texts.board,
         )
-        guided_all(
-            package,
-            [(one.guide, one.finish) for one in wanted],
-            writer,
-            settings,
-            Several(uis),
-            sensors.clock,
-            stopped=stopped,
-        )
+        views = [(one.guide, one.finish) for one in wanted]
+        try:
+            guided_all(package, views, writer, settings, Several(uis), sensors.clock, stopped=stopped)
+        except CaptureAbortedError as error:
+            console.print(f"{error}; nothing was kept, and nothing in use has changed", highlight=False)
+            name = stopped()
+            sys.exit(1 if name is None else 128 + signal.Signals[name])
     return path
 
 

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from cli_site import state_of, surfclass
+from cli_site import running, state_of, surfclass
 
 from calibration.rotations import motion
 from calibration.store import Store
@@ -146,3 +146,47 @@ def test_killing_it_at_any_moment_leaves_the_old_result_whole(commissioned_once,
         assert Store(kept).current("hand-eye").number >= first
     surfclass(*command[3:], cwd=tmp_path)
     assert Store(kept).current("hand-eye").passed
+
+
+def live_site(folder, scene):
+    """A configuration of simulated devices before a scene's targets, and the rig that is commissioned."""
+    (folder / "rig.toml").write_text(truth.rig(SimWorld(scene, scale=0.25)))
+    (folder / "plate.toml").write_text(truth.plate_toml(SimWorld("reflector_discs", scale=0.25)))
+    devices = "".join(f'[{kind}]\nbackend = "sim"\n' for kind in ("colour", "depth", "light", "arm"))
+    (folder / "surfclass.toml").write_text(
+        'schema = 1\nrig = "rig.toml"\nmodel = "model.npz"\n[calibration]\ndirectory = "kept"\n'
+        f'plate = "plate.toml"\n{devices}[sim]\nscene = "{scene}"\nscale = 0.25\n'
+    )
+
+
+def test_live_a_step_captures_solves_keeps_and_can_be_solved_again(tmp_path):
+    live_site(tmp_path, "exposure_card")
+    arguments = ("calibrate", "response", "-c", "surfclass.toml", "--no-page", "--json")
+    surfclass(*arguments, "live.json", cwd=tmp_path)
+    (recording,) = (tmp_path / "kept" / "captures").glob("response-*.mcap")
+    live = json.loads((tmp_path / "live.json").read_text())
+    assert live["devices"]["colour"] == "SIM-COLOUR"
+    assert Store(tmp_path / "kept").current("response").number == 1
+    surfclass(*arguments, "again.json", "--from", recording, cwd=tmp_path)
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert again["inverse"] == live["inverse"]
+    assert again["inputs"] == live["inputs"]
+    assert Store(tmp_path / "kept").current("response").number == 2
+
+
+def test_live_a_signal_ends_it_with_nothing_kept_and_nothing_changed(tmp_path):
+    live_site(tmp_path, "cell")  # where there are no discs, so that it goes on
+    before = state_of(tmp_path)
+    log = tmp_path.parent / "live.log"
+    with running(log, "calibrate", "hand-eye", "-c", "surfclass.toml", "--no-page", cwd=tmp_path) as process:
+        until = time.monotonic() + 60
+        while "refused" not in log.read_text():
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < until, log.read_text()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 128 + signal.SIGTERM
+    said = log.read_text()
+    assert "Traceback" not in said
+    assert "stopped by SIGTERM" in said
+    assert state_of(tmp_path) == before
