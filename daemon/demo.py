@@ -103,7 +103,7 @@ def run_demo(
 
 def _clear(out: Path) -> None:
     """Removes what an earlier demo left; nothing that a demo does not write."""
-    for folder in ("recordings", "calibration"):
+    for folder in ("recordings", "commissioned"):
         shutil.rmtree(out / folder, ignore_errors=True)
     for pattern in ("*.mcap", "*.mcap.active", "*.npz", "*.png", "*.ply", "*.json", "*.toml", "*.log"):
         for path in out.glob(pattern):

@@ -46,7 +46,7 @@ def commission_simulated(out: Path, seed: int) -> str:
     def call(kind: Kind, scene: str) -> Call:
         console.rule(f"[bold]surfclass calibrate {kind}[/bold] --set sim.scene={scene}", style="dim")
         overrides = [f"sim.scene={scene}", f"sim.seed={seed}"]
-        pictures = out / "calibration" / "pictures"
+        pictures = out / "commissioned" / "pictures"
         return replace(steps.call(kind, out / CONFIG, overrides, None, None, None, pictures), page=False)
 
     run: list[Callable[[], int]] = [
@@ -93,7 +93,7 @@ rig = "nominal.toml"
 model = "model.npz"
 
 [calibration]
-directory = "calibration"
+directory = "commissioned"
 plate = "plate.toml"
 board = "board.toml"
 

@@ -17,7 +17,7 @@ from surfclass.reflectance import OVER_EXPOSED, UNDER_EXPOSED
 from surfclass.rig import DepthRig
 from surfclass.types import Bool, Float64
 
-VIEWS = 5
+VIEWS = 8
 _NEW_TILT_RAD = np.radians(4.0)
 _NEW_DISTANCE = 0.12  # of the distance
 _MOST_SATURATED = 0.25
@@ -39,6 +39,8 @@ _PLAN = (
     "turn the board by 8° about the horizontal, 0.8 m away; the highlight moves up or down",
     "turn the board by 8° the other way about the horizontal, 0.9 m away",
     "put the board 1.1 m away, turned by a few degrees",
+    "turn the board by 6° about both, 0.65 m away",
+    "turn the board by 6° about both the other way, 1.0 m away",
 )
 
 
