@@ -149,6 +149,16 @@ def overlay(recording_rig: DepthRig, directory: Path | None) -> DepthRig:
     return recording_rig if directory is None else recording_rig.with_values(Store(directory).values())
 
 
+def store_of(call: Call) -> Store | None:
+    """Returns where results are kept, or None.
+
+    Raises:
+        ConfigurationError: If the configuration is not valid.
+    """
+    config = load_config(call.config, call.overrides) if call.config or call.overrides else None
+    return _place(call, config)[0]
+
+
 def _place(call: Call, config: Config | None) -> tuple[Store | None, Gates]:
     """Where results are kept, if anywhere, and the limits."""
     told = None if config is None else config.calibration

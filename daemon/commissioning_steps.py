@@ -16,7 +16,7 @@ from calibration.outcome import Kind, Note, Outcome
 from calibration.source import Source
 from calibration.store import KINDS
 from calibration.verify.report import About, html, report_of
-from daemon.commissioning import Call, Ended, commission
+from daemon.commissioning import Call, Ended, commission, store_of
 from daemon.commissioning_live import Texts, Wanted
 from daemon.config import Config
 from daemon.offline import console, open_recording
@@ -135,7 +135,8 @@ def hand_eye(
     from calibration.hand_eye.guide import HandEyeGuide
 
     board = told.board()
-    options = Options(observations, target, board, None, joint_offsets, flange_offset)
+    known = {} if observations is not None else _camera_sd(call)
+    options = Options(observations, target, board, None, joint_offsets, flange_offset, known)
     call = replace(
         call,
         options={
@@ -180,6 +181,19 @@ def cameras(call: Call, told: BoardTold) -> int:
 
     options_told = {"board": None if board is None else str(board)}
     return commission(replace(call, options=options_told), solve, targets)
+
+
+def _camera_sd(call: Call) -> dict[Literal["rgb", "depth"], list[float]]:
+    """How well fx, fy, cx, cy of each camera are known, by the result in use."""
+    store = store_of(call)
+    in_use = None if store is None else store.current("cameras")
+    cameras_told = {} if in_use is None else in_use.told.get("cameras", {})
+    names: tuple[Literal["rgb"], Literal["depth"]] = ("rgb", "depth")
+    return {
+        name: [cameras_told[name]["sd"][key] for key in ("fx", "fy", "cx", "cy")]
+        for name in names
+        if "sd" in cameras_told.get(name, {})
+    }
 
 
 def rod(radii_mm: tuple[float, float], distance_mm: float) -> SpheresOptions:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +41,8 @@ class Options:
         eye: Which camera looks at a board; None: the colour camera where its place is known, else IR.
         joint_offsets: Whether to find the joints' offsets that can be seen.
         flange_offset: Whether to find the last D-H length.
+        camera_sd: By camera, the standard deviations of fx, fy, cx, cy in px, where they are known: what they
+            do to the result is part of its own.
     """
 
     observations: Path | None = None
@@ -48,6 +51,7 @@ class Options:
     eye: Eye | None = None
     joint_offsets: bool = False
     flange_offset: bool = False
+    camera_sd: Mapping[Eye, Sequence[float]] = field(default_factory=dict)
 
 
 def calibrate(source: Source | None, options: Options, gates: HandEyeGates, note: Note) -> Outcome:
@@ -71,7 +75,10 @@ def calibrate(source: Source | None, options: Options, gates: HandEyeGates, note
         seen, eye = _observed(source, options, note)
     else:
         raise InputError("hand-eye: needed is either a recording (--from) or an observations file")
-    solution = solve(seen, arm.flange_offset_m, note, options.joint_offsets, options.flange_offset)
+    pinhole_sd = options.camera_sd.get(eye)
+    solution = solve(
+        seen, arm.flange_offset_m, note, options.joint_offsets, options.flange_offset, pinhole_sd
+    )
     note("comparing with the closed forms")
     forms = compare(solution.problem, solution.fit)
     proposals = propose(solution.problem, solution.fit, seen)

@@ -53,6 +53,7 @@ def result_of(
         "adjusted_rms_m": adjusted[1],
         "jackknife_sd": _split(solution.sd),
         "formal_sd": _split(np.sqrt(np.diag(in_outer_frame(fit, fit.covariance)))),
+        "camera_share": _split(solution.camera_sd),
         "covariance_rotation_translation": solution.covariance.tolist(),
         "outlier_poses": outlier_numbers(solution),
         "poses": _poses(solution, seen),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from calibration.hand_eye.adjustment import Fit, adjust, deviations_of
 from calibration.hand_eye.adjustment_columns import Free, State
 from calibration.hand_eye.arm_offsets import ArmOffsets, free_offsets
+from calibration.hand_eye.camera_share import camera_share
 from calibration.hand_eye.intrinsics import ESTIMATED, estimate_intrinsics
 from calibration.hand_eye.leave_out import LeftOut, in_outer_frame, left_out, whole_points
 from calibration.hand_eye.normal_equations import Noise
@@ -43,6 +45,7 @@ class Solution:
         scale: Factor on the target's size that fits best, and its standard deviation; None where the
             target's shape came from probing.
         arm: Offsets of the arm, where they were asked for.
+        camera_sd: (6,) what the camera's own uncertainty adds, as `sd`; zeros where it is not known.
     """
 
     problem: Problem
@@ -51,6 +54,7 @@ class Solution:
     guesses: dict[str, Guess]
     scale: tuple[float, float] | None
     arm: ArmOffsets | None
+    camera_sd: Float64 = field(default_factory=lambda: np.zeros(6))
 
     @property
     def covariance(self) -> Float64:
@@ -66,10 +70,10 @@ class Solution:
         """(6,) the standard deviations to trust: the jackknife's, but none smaller than the formal one.
 
         Both scatter where there are few poses, and of two estimates that scatter the smaller one is the
-        one that misleads.
+        one that misleads. The camera's own uncertainty comes on top.
         """
         formal = np.diag(in_outer_frame(self.fit, self.fit.covariance))
-        return np.sqrt(np.maximum(formal, np.diag(self.covariance)))
+        return np.sqrt(np.maximum(formal, np.diag(self.covariance)) + self.camera_sd**2)
 
 
 def solve(
@@ -78,6 +82,7 @@ def solve(
     note: Note,
     joint_offsets: bool = False,
     flange_offset: bool = False,
+    pinhole_sd: Sequence[float] | None = None,
 ) -> Solution:
     """Returns the hand-eye transform and all that goes with it.
 
@@ -87,6 +92,7 @@ def solve(
         note: Called at each step.
         joint_offsets: Whether to estimate the arm's joint offsets.
         flange_offset: Whether to estimate the last D-H length.
+        pinhole_sd: Standard deviations of the camera's fx, fy, cx, cy, px, where they are known.
 
     Raises:
         RefusedError: Naming what the data cannot determine, and what to do.
@@ -116,7 +122,10 @@ def solve(
         raise RefusedError(*open_)
     note("leaving out each pose")
     rest = left_out(problem, fit) if fit.keep.sum() >= _FEWEST_TO_CHECK else None
-    return Solution(problem, fit, rest, guesses, scale, arm)
+    shared = np.zeros(6)
+    if pinhole_sd is not None and not free.intrinsics and seen.intrinsics is not None:
+        shared = camera_share(problem, fit, pinhole_sd)
+    return Solution(problem, fit, rest, guesses, scale, arm, shared)
 
 
 def outliers(surprise: Float64, keep: Bool) -> Bool:
