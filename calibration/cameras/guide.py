@@ -15,7 +15,7 @@ from calibration.guide import Look
 from surfclass.frames import Capture
 from surfclass.rig import DepthRig
 
-NEEDED = 16
+NEEDED = 36  # the depth camera's principal point needs them: its corners are blurred by speckle
 _TILT = 0.26  # sine of 15°: from here on a board counts as tilted
 _TOO_ALIKE = 0.06  # of the image's width: how far some corner must have moved
 _WIDEST_EDGE = 0.25  # of a square's side: a checkerboard's edges that are wider are not sharp

@@ -80,7 +80,7 @@ def test_ambient_light_is_there_without_the_led():
     [
         ("cell", "corner_090"),
         ("cell", "lower_075"),
-        ("checkerboard", "view_04"),
+        ("checkerboard", "tilt_04"),
         ("reflector_discs", "tilt_00"),
     ],
 )
