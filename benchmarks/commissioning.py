@@ -66,7 +66,7 @@ def errors(rig: Rig, store: Store, seed: int) -> tuple[list[float], list[float]]
 def main() -> None:
     first, count = (int(value) for value in (*sys.argv[1:3], "0", "3")[:2])
     heads = "  ".join(f"{name:>15}" for name in NAMES)
-    print(f"seed  {heads}   sigmas: cameras hand-eye light", flush=True)
+    print(f"seed  {heads}   sigmas: between, hand-eye, light", flush=True)
     rows, all_sigmas = [], []
     for seed in range(first, first + count):
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
