@@ -1,6 +1,6 @@
 """Commissions the simulated cell over several seeds, live, and compares every result with the truth.
 
-Each seed is another draw of all noise and of all textures. Prints for each seed how far each result is off, and
+Each seed draws all noise and all textures anew. Prints for each seed how far each result is off, and
 the most of its reported standard deviations that any component is off by; then the rms over the seeds.
 
     python -m benchmarks.commissioning [FIRST] [COUNT]
