@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from cli_site import running, state_of, surfclass
 
+from calibration.outcome import Outcome
 from calibration.rotations import motion
-from calibration.store import Store
+from calibration.store import Provenance, Store, described
+from drivers.recordings import RecordingWriter
 from drivers.sim import truth
 from drivers.sim.world import SimWorld
+from surfclass.rig import parse_rig
 
 TURNS = [
     (0.5, 0, 0),
@@ -190,3 +193,20 @@ def test_live_a_signal_ends_it_with_nothing_kept_and_nothing_changed(tmp_path):
     assert "Traceback" not in said
     assert "stopped by SIGTERM" in said
     assert state_of(tmp_path) == before
+
+
+def test_captures_of_another_camera_are_refused_until_that_is_meant(tmp_path):
+    rig = truth.rig(SimWorld("grey_card", scale=0.1))
+    outcome = Outcome("cameras", "pass", (), "", {"schema": 1})
+    provenance = Provenance("old.mcap", {}, {}, {}, {"colour": "A1", "depth": "D1"})
+    Store(tmp_path / "kept").add("cameras", described(outcome, provenance, parse_rig(rig, "rig")))
+    RecordingWriter(tmp_path / "new.mcap", rig, None, {"serial of colour": "B2"}).close()
+    before = state_of(tmp_path / "kept")
+    arguments = ("calibrate", "response", "--from", "new.mcap", "--calibration", "kept", "--json", "-")
+    told = json.loads(surfclass(*arguments, cwd=tmp_path, code=1).stdout)
+    assert told["verdict"] == "refused"
+    assert "B2" in told["reasons"][0]
+    assert "A1" in told["reasons"][0]
+    meant = json.loads(surfclass(*arguments, "--new-devices", cwd=tmp_path, code=1).stdout)
+    assert "B2" not in str(meant["reasons"])  # it has no captures, which is another matter
+    assert state_of(tmp_path / "kept") == before
