@@ -196,6 +196,14 @@ def _camera_sd(call: Call) -> dict[Literal["rgb", "depth"], list[float]]:
     }
 
 
+def _between_sd(call: Call) -> tuple[float, ...] | None:
+    """How well `rgb_T_depth` is known, rotation (rad) and translation (m), by the result in use."""
+    store = store_of(call)
+    in_use = None if store is None else store.current("cameras")
+    sd = None if in_use is None else in_use.told.get("extrinsic_sd")
+    return None if sd is None else (*sd["rotation_rad"], *sd["translation_m"])
+
+
 def rod(radii_mm: tuple[float, float], distance_mm: float) -> SpheresOptions:
     """Returns the rod with two spheres, of which the first one is nearer to its tip."""
     from calibration.hand_eye.spheres_command import SpheresOptions
@@ -315,7 +323,7 @@ def light(
     from calibration.light.guide import LightGuide
     from calibration.response.guide import ResponseGuide
 
-    options = Options(use=use, thesis=thesis)
+    options = Options(use=use, thesis=thesis, between_sd=_between_sd(call))
 
     def solve(source: Given, gates: Gates, note: Note) -> Outcome:
         assert isinstance(source, Source)  # there are captures, or the call has failed

@@ -34,10 +34,13 @@ class LightOptions:
     Attributes:
         use: "boards": `light` captures alone; "lambertian": `response` captures alone; "all".
         thesis: Only the position, by Eq. 4.5–4.10 (corrected) from each board, and their mean.
+        between_sd: (6,) standard deviations of `rgb_T_depth`, rotation (rad) and translation (m), where they
+            are known: what they do to the result is part of its own.
     """
 
     use: Use = "all"
     thesis: bool = False
+    between_sd: tuple[float, ...] | None = None
 
 
 Options = LightOptions
@@ -74,7 +77,7 @@ def calibrate(source: Source, options: LightOptions, gates: LightGates, note: No
     if options.thesis:
         return _thesis(locate_by_each_board(source, rig, inverse), source)
     views = board_views(source, rig, inverse, options.use, note)
-    estimate = estimate_light(views)
+    estimate = estimate_light(views, between_sd=options.between_sd)
     note(f"fitted light and lens to {len(estimate.views)} views; now the comparison with the thesis' method")
     values: dict[str, Any] = rig_values(estimate)
     if response:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from calibration.light.fit import LightFit, PositionPrior, fit_light
 from calibration.light.near_light import GLOBAL, POSITION
 from calibration.light.samples import BoardSamples, enough, sample_board, too_bright
 from calibration.outcome import Note, RefusedError
+from calibration.rotations import rotation_matrix
 from calibration.source import Source
 from surfclass.errors import InputError
 from surfclass.rig import Rig
@@ -91,8 +92,18 @@ def board_views(source: Source, rig: Rig, inverse: Float64, use: Use, note: Note
     return views
 
 
-def estimate_light(views: Sequence[BoardSamples], known: PositionPrior | None = None) -> LightEstimate:
+def estimate_light(
+    views: Sequence[BoardSamples],
+    known: PositionPrior | None = None,
+    between_sd: Sequence[float] | None = None,
+) -> LightEstimate:
     """Returns light and lens.
+
+    Args:
+        views: Of boards.
+        known: What is known of the position besides.
+        between_sd: (6,) standard deviations of `rgb_T_depth`, rotation (rad) and translation (m): all boards
+            are where it says, so no view shows its error.
 
     Raises:
         RefusedError: If the views cannot determine them, saying what is missing.
@@ -106,6 +117,8 @@ def estimate_light(views: Sequence[BoardSamples], known: PositionPrior | None = 
         )
     rows = fit.leave_out(found)
     covariance = fit.covariance(found, rows)
+    if between_sd is not None:
+        covariance = covariance + _from_between(usable, found, known, between_sd)
     names = found.observed.names
     estimate = LightEstimate(
         tuple(usable),
@@ -122,6 +135,26 @@ def estimate_light(views: Sequence[BoardSamples], known: PositionPrior | None = 
             "distances from 0.6 to 1.3 m"
         )
     return estimate
+
+
+def _from_between(
+    views: Sequence[BoardSamples], found: LightFit, known: PositionPrior | None, between_sd: Sequence[float]
+) -> Float64:
+    """(10, 10) what the uncertainty of `rgb_T_depth` adds: each of its numbers moved, and fitted again."""
+    added = np.zeros((GLOBAL, GLOBAL))
+    for step in np.diag(between_sd):
+        if not step.any():
+            continue
+        turn = rotation_matrix(step[:3])
+        moved = []
+        for view in views:
+            normal = turn @ view.plane.normal
+            plane = replace(view.plane, normal=normal, offset=view.plane.offset + float(normal @ step[3:]))
+            moved.append(replace(view, plane=plane))
+        again = fit_light(moved, found.parameters[POSITION], known)
+        off = again.parameters[:GLOBAL] - found.parameters[:GLOBAL]
+        added += np.outer(off, off)
+    return added
 
 
 def starting_position(views: Sequence[BoardSamples]) -> Float64:
