@@ -110,7 +110,7 @@ def test_a_wrong_square_size_is_refused_by_the_depth(captures, tmp_path):
 
 
 def test_another_board_than_told_is_named(captures, tmp_path):
-    source = recorded(tmp_path / "a.mcap", captures[:2], BOARD_TOML.replace("9", "7"))
+    source = recorded(tmp_path / "a.mcap", captures[:1], BOARD_TOML.replace("9", "7"))
     with pytest.raises(RefusedError, match="--board 9x6"):
         solved(source)
 

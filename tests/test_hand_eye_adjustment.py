@@ -320,7 +320,7 @@ def spread(seeds, **world):
 @pytest.mark.parametrize(
     ("seeds", "kind", "poses"),
     [
-        (20, "pixels", 8),
+        (12, "pixels", 8),
         pytest.param(100, "pixels", 14, marks=pytest.mark.slow),
         pytest.param(100, "positions", 14, marks=pytest.mark.slow),
         pytest.param(100, "both", 8, marks=pytest.mark.slow),

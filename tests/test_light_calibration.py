@@ -18,6 +18,7 @@ from calibration.light.samples import board_plane, sample_board
 from calibration.light.thresholds import thresholds
 from calibration.outcome import RefusedError, plain
 from calibration.response.guide import ResponseGuide
+from calibration.rotations import rotation_matrix
 from surfclass.colour import as_fraction
 from surfclass.errors import InputError
 from surfclass.frames import ColourFrame
@@ -74,6 +75,25 @@ def test_boards_alone_give_light_and_lens(coat):
     assert abs(v2 * r2 + v4 * r2**2 + v6 * r2**3) < 0.01
     assert estimate.position_sd < 0.004
     assert estimate.fit.parameters[near_light.COAT] == pytest.approx(coat, abs=0.3)
+
+
+def turned(views, about):
+    """The boards as somebody has them whose `rgb_T_depth` is turned by the rotation vector `about`."""
+    planes = [replace(view.plane, normal=rotation_matrix(about) @ view.plane.normal) for view in views]
+    return [replace(view, plane=plane) for view, plane in zip(views, planes, strict=True)]
+
+
+def test_what_is_between_the_cameras_counts_since_no_view_shows_its_error(boards):
+    sd = 8e-4
+    unaware = estimate_light(boards)
+    aware = estimate_light(boards, between_sd=(sd, sd, sd, 0, 0, 0))
+    assert aware.fit.position == pytest.approx(unaware.fit.position)
+    off = np.zeros(3)
+    for about in np.diag([sd, sd, sd]):
+        off += (estimate_light(turned(boards, about)).fit.position - unaware.fit.position) ** 2
+    added = np.diag(aware.covariance)[:3] - np.diag(unaware.covariance)[:3]
+    assert np.sqrt(added) == pytest.approx(np.sqrt(off), rel=0.3, abs=3e-4)
+    assert np.sqrt(added).max() > 2e-4
 
 
 def test_cards_make_it_better(boards, cards):

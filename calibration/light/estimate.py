@@ -118,7 +118,7 @@ def estimate_light(
     rows = fit.leave_out(found)
     covariance = fit.covariance(found, rows)
     if between_sd is not None:
-        covariance = covariance + _from_between(usable, found, known, between_sd)
+        covariance = covariance + _from_between(usable, found, between_sd)
     names = found.observed.names
     estimate = LightEstimate(
         tuple(usable),
@@ -137,9 +137,7 @@ def estimate_light(
     return estimate
 
 
-def _from_between(
-    views: Sequence[BoardSamples], found: LightFit, known: PositionPrior | None, between_sd: Sequence[float]
-) -> Float64:
+def _from_between(views: Sequence[BoardSamples], found: LightFit, between_sd: Sequence[float]) -> Float64:
     """(10, 10) what the uncertainty of `rgb_T_depth` adds: each of its numbers moved, and fitted again."""
     added = np.zeros((GLOBAL, GLOBAL))
     for step in np.diag(between_sd):
@@ -151,8 +149,7 @@ def _from_between(
             normal = turn @ view.plane.normal
             plane = replace(view.plane, normal=normal, offset=view.plane.offset + float(normal @ step[3:]))
             moved.append(replace(view, plane=plane))
-        again = fit_light(moved, found.parameters[POSITION], known)
-        off = again.parameters[:GLOBAL] - found.parameters[:GLOBAL]
+        off = (fit.refit(found, moved) - found.parameters)[:GLOBAL]
         added += np.outer(off, off)
     return added
 

@@ -100,6 +100,13 @@ def fit_light(views: Sequence[BoardSamples], start: Float64, known: PositionPrio
     return LightFit(found.parameters, observed, residual, sd, _uneven(gain, observed, residual), known)
 
 
+def refit(found: LightFit, views: Sequence[BoardSamples]) -> Float64:
+    """Returns the parameters (p,) for the same views with their boards elsewhere, as weighted before."""
+    observed = Observed.of(views)
+    problem = _Problem(observed, found.weight_sd, np.ones(len(found.weight_sd)), 1.0, found.known)
+    return minimise(problem, found.parameters, *near_light.bounds(observed)).parameters
+
+
 def leave_out(whole: LightFit) -> Float64:
     """Returns all parameters (v, p) with each view left out in turn; what only it shows stays as it is."""
     observed = whole.observed
