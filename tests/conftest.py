@@ -15,6 +15,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+# GigE Vision has one port on a computer, so what emulates such a camera takes turns: in one process.
+_ONE_CAMERA = {"test_contract.py", "test_aravis_camera.py", "test_gige_camera.py", "test_real_drivers.py"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keeps each file's tests in one process (`--dist loadgroup`), and all that need the one camera too."""
+    for item in items:
+        group = "one camera" if item.path.name in _ONE_CAMERA else item.path.name
+        item.add_marker(pytest.mark.xdist_group(group))
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of reference data beside the project; a test that needs it skips where it is missing."""
