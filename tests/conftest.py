@@ -19,6 +19,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 _ONE_CAMERA = {"test_contract.py", "test_aravis_camera.py", "test_gige_camera.py", "test_real_drivers.py"}
 
 
+@pytest.hookimpl(tryfirst=True)  # before the distribution reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keeps each file's tests in one process (`--dist loadgroup`), and all that need the one camera too."""
     for item in items:
