@@ -1,6 +1,7 @@
 """Fixtures that every test can use."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,12 +20,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 _ONE_CAMERA = {"test_contract.py", "test_aravis_camera.py", "test_gige_camera.py", "test_real_drivers.py"}
 
 
-@pytest.hookimpl(tryfirst=True)  # before the distribution reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keeps each file's tests in one process (`--dist loadgroup`), and all that need the one camera too."""
-    for item in items:
-        group = "one camera" if item.path.name in _ONE_CAMERA else item.path.name
-        item.add_marker(pytest.mark.xdist_group(group))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Keeps each file's tests in one process, and all that need the one camera in one, too."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class OneCamera(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return "one camera" if Path(file).name in _ONE_CAMERA else file
+
+    return OneCamera(config, log)
 
 
 @pytest.fixture(scope="session")
