@@ -164,7 +164,10 @@ class Recording:
         Raises:
             InputError: Where the file turns out to be damaged.
         """
-        return Counter(parse_record(entry.data, str(self.path)).role for entry in self._entries((CAPTURE,)))
+        entries = self._entries((CAPTURE,))
+        found = Counter(parse_record(entry.data, str(self.path)).role for entry in entries)
+        self._must_be_all(found.total())
+        return found
 
     def updates(self) -> Iterator[bytes]:
         """Yields the encoded map updates in the order in which they were written.
@@ -176,10 +179,12 @@ class Recording:
 
     def _captures(self, roles: Collection[str]) -> Iterator[Capture]:
         parts: dict[str, Entry] = {}
+        seen = 0
         for entry in self._entries((*_IMAGE_TOPICS, JOINTS, CAPTURE)):
             if entry.topic != CAPTURE:
                 parts[entry.topic] = entry
                 continue
+            seen += 1
             record = parse_record(entry.data, str(self.path))
             if record.role in roles:
                 own = {topic: part for topic, part in parts.items() if part.sequence == entry.sequence}
@@ -187,6 +192,15 @@ class Recording:
                 self.depth_rig.check(capture)
                 yield capture
             parts = {}
+        self._must_be_all(seen)
+
+    def _must_be_all(self, seen: int) -> None:
+        """Raises InputError where the index, which says what to read, hides captures."""
+        if seen != self.count:
+            raise InputError(
+                f"{self.path}: damaged: its index leads to {seen} captures, {self.count} were written; "
+                f"`surfclass recover {self.path}` saves those that are whole"
+            )
 
     def _entries(self, topics: Collection[str]) -> Iterator[Entry]:
         # The library's reader would unpack the whole file before it gives the first message.
