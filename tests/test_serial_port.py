@@ -25,15 +25,17 @@ class Wire:
     """A pseudo-terminal; the test is the device at its other end."""
 
     def __init__(self):
+        self._ends = threading.Lock()
         self.master, self.slave = os.openpty()
         tty.setraw(self.slave)
         self.path = os.ttyname(self.slave)
 
     def unplug(self):
-        for end in (self.master, self.slave):
-            if end is not None:
-                os.close(end)
-        self.master = self.slave = None
+        with self._ends:  # a timer of the test may still be at it when the test is over
+            for end in (self.master, self.slave):
+                if end is not None:
+                    os.close(end)
+            self.master = self.slave = None
 
 
 @pytest.fixture
