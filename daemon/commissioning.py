@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 from rich.table import Table
 
+from calibration.cameras.conditions import serial_faults
 from calibration.cameras.pairs import ImagePairs, holds_pairs
 from calibration.gates import Gates
 from calibration.outcome import Kind, Note, Outcome, RefusedError, refused
@@ -191,14 +192,14 @@ def _same_devices(source: Source, store: Store) -> None:
     in_use = store.current("cameras")
     if in_use is None:
         return
-    differing = [
-        f"the {device} camera of these captures has the serial number {serial}, the calibration in use "
-        f"({in_use.path}) is of {in_use.devices[device]}: calibrate the cameras first, with --new-devices"
-        for device, serial in source.devices.items()
-        if device in ("colour", "depth") and in_use.devices.get(device, serial) != serial
-    ]
-    if differing:
-        raise RefusedError(*differing)
+    calibrated = {
+        device: in_use.devices[device] for device in ("colour", "depth") if device in in_use.devices
+    }
+    faults = serial_faults(calibrated, source.devices)
+    if faults:
+        raise RefusedError(
+            *faults, f"{in_use.path} is in use: calibrate the cameras first, with --new-devices"
+        )
 
 
 def _provenance(call: Call, source: Source | ImagePairs | None, gates: Gates) -> Provenance:

@@ -107,13 +107,13 @@ def daniilidis(a: Float64, b: Float64) -> Float64:
     rows[:, 3:, 1:4] = skew(a_dual + b_dual)
     _, _, vt = np.linalg.svd(rows.reshape(-1, 8), full_matrices=False)
     u, v = vt[6], vt[7]
-    # The combination l·u + m·v that is a unit dual quaternion: its real and dual parts are at right
-    # angles (a quadratic in l/m or m/l, whichever stays finite), and the real part is 1 long.
+    # The combination a·u + b·v that is a unit dual quaternion: its real and dual parts are at right
+    # angles (a quadratic in a/b or b/a, whichever stays finite), and the real part is 1 long.
     square = np.array([u[:4] @ u[4:], u[:4] @ v[4:] + v[:4] @ u[4:], v[:4] @ v[4:]])
     turned = abs(square[0]) < abs(square[2])
     roots = np.roots(square[::-1] if turned else square).real
     ratios = [(1.0, root) if turned else (root, 1.0) for root in roots]
-    candidates = [l * u + m * v for l, m in ratios]  # noqa: E741
+    candidates = [a * u + b * v for a, b in ratios]
     best = max(candidates, key=lambda one: float(one[:4] @ one[:4]) / float(one @ one))
     real, dual = best[:4], best[4:]
     length = np.linalg.norm(real)
