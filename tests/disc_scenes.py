@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, fields
 import cv2
 import numpy as np
 
+from calibration.hand_eye.discs_find import look_for_discs
 from calibration.rotations import motion
 from surfclass.frames import DepthFrame
 from surfclass.geometry import project, rays
@@ -125,3 +126,8 @@ class Plate:
         place, _ = self.on_plate()
         away = [np.hypot(place[0] - x, place[1] - y) for x, y, _ in self.places_m]
         return np.min(away, axis=0) < grow * RADIUS_M
+
+
+def find_discs(frame, camera, radius_m):
+    """The discs alone, without what was not taken for one."""
+    return list(look_for_discs(frame, camera, radius_m).discs)

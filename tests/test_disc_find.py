@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-from disc_scenes import CAMERA, PLACES_M, RADIUS_M, Plate
+from disc_scenes import CAMERA, PLACES_M, RADIUS_M, Plate, find_discs
 
-from calibration.hand_eye.discs_find import find_discs, look_for_discs
+from calibration.hand_eye.discs_find import look_for_discs
 from calibration.hand_eye.discs_picture import draw_discs
 from surfclass.errors import InputError
 from surfclass.frames import DepthFrame

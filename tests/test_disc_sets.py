@@ -6,10 +6,10 @@ import tomllib
 import cv2
 import numpy as np
 import pytest
+from disc_scenes import find_discs
 
 from calibration.gates import HandEyeGates
 from calibration.hand_eye.command import Options, calibrate
-from calibration.hand_eye.discs_find import find_discs
 from calibration.rotations import difference
 from calibration.source import Source
 from drivers.sim import truth

@@ -35,11 +35,6 @@ _FAINT = 0.2  # of the faintest disc's brightness
 _DEPTH_FLOOR_M = 1e-4  # whole millimetres, and the sensor's own steps, do not average out on a flat disc
 
 
-def find_discs(frame: DepthFrame, camera: Camera, radius_m: float) -> list[Disc]:
-    """Returns the reflector discs of a frame, as `look_for_discs` finds them."""
-    return list(look_for_discs(frame, camera, radius_m).discs)
-
-
 def look_for_discs(
     frame: DepthFrame, camera: Camera, radius_m: float, depth_mm: NDArray[Any] | None = None
 ) -> Sighting:
